@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     )
     from drakegrasp.cluster.connect import connect
     from drakegrasp.config import Config
-    from drakegrasp.dataset.checks.rows import Violation
-    from drakegrasp.dataset.checks.run import check_dataset
+    from drakegrasp.dataset.check import check_dataset
+    from drakegrasp.dataset.check_rows import Violation
     from drakegrasp.dataset.reader import GraspDataset, Sample
     from drakegrasp.dataset.scenes import SceneDataset
     from drakegrasp.dataset.trials import Trials
@@ -80,9 +80,9 @@ _HOMES = {
     "Score": "scoring.run",
     "Trials": "dataset.trials",
     "Verification": "verification.result",
-    "Violation": "dataset.checks.rows",
+    "Violation": "dataset.check_rows",
     "build_dataset": "api.building",
-    "check_dataset": "dataset.checks.run",
+    "check_dataset": "dataset.check",
     "cloud_from_depth": "vision.depth_image",
     "connect": "cluster.connect",
     "fit_table": "vision.depth_image",

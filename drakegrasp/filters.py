@@ -12,7 +12,7 @@ All functions are pure functions of arrays. The module imports only NumPy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Literal, Protocol
@@ -243,11 +243,6 @@ def first_removal(t: Table, limits: Limits, rules: Sequence[Rule] = RULES) -> np
         if rule.is_on(limits) and t.has(*rule.needs):
             removal[rule.refuses(t, limits) & (removal == Removal.KEPT)] = rule.removal
     return removal
-
-
-def rules_of_hold() -> Iterator[Rule]:
-    """Yield the rules that judge how the hand holds the object."""
-    return (rule for rule in RULES if rule.of_hold)
 
 
 def is_outlier(values: Array, sigma: float) -> Flags:

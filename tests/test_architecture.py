@@ -78,7 +78,7 @@ READERS = (
     *("grasp", "dataset.schema", "dataset.shards", "dataset.reader", "dataset.trials"),
     "dataset.scenes",
 )
-CHECKERS = ("dataset.checks.run", "dataset.assemble")
+CHECKERS = ("dataset.check", "dataset.assemble")
 
 
 def modules() -> dict[str, Path]:

@@ -121,7 +121,7 @@ def assemble(
     """
     from drakegrasp.cli import tables
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.checks.run import carried_hand_as_built
+    from drakegrasp.dataset.check import check_hand
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.rejections import read_rejected, unused_rejections
 
@@ -136,7 +136,7 @@ def assemble(
     tables.print_stats(out)
     for sentence in unused_rejections(out, rejected, manifest.rejected):
         say(sentence)
-    for changed in carried_hand_as_built(manifest):
+    for changed in check_hand(manifest):
         say(f"{changed}; the card leaves out its drive, load limit and licence")
 
 
@@ -230,7 +230,7 @@ def check(path: Path, workers: int | None, as_json: bool) -> None:
     OUT is the directory of a dataset; FILE is one of its HDF5 files. The exit code is 1 if an
     invariant is broken.
     """
-    from drakegrasp.dataset.checks.run import check_dataset
+    from drakegrasp.dataset.check import check_dataset
 
     with processes(workers) as execute, progress_bar("check", "steps") as progress:
         violations = check_dataset(path, execute=execute, progress=progress)

@@ -147,7 +147,9 @@ def assemble_locked(
         # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
         with ExitStack() as stack:
-            files = {c: stack.enter_context(new_hdf5(path)) for c, path in paths.items()}
+            files = {
+                c: stack.enter_context(new_hdf5(path, sealed=True)) for c, path in paths.items()
+            }
             for camera, file in files.items():
                 file.attrs.update(file_attributes(manifest, shards.seals, camera))
                 counts = {split: len(ids) for split, ids in decisions.ids.items()}

@@ -263,21 +263,6 @@ def packed_chunk(values: AnyArray, rows: int) -> bytes:
     return zlib.compress(planes.tobytes(), GZIP_LEVEL)
 
 
-def unpacked_chunk(chunk: bytes, skipped: int, like: h5py.Dataset) -> AnyArray:
-    """Return the row (1, ...) of a chunk that `create_field` or `write_fixed` packed.
-
-    Args:
-        chunk: The stored bytes.
-        skipped: Mask of the filters that HDF5 skipped: 1 the order of bytes, 2 the compression.
-        like: A dataset of the same type, with rows of the same shape.
-    """
-    content = chunk if skipped & 2 else zlib.decompress(chunk)
-    planes = np.frombuffer(content, dtype=np.uint8)
-    if not skipped & 1:
-        planes = planes.reshape(like.dtype.itemsize, -1).T.copy().reshape(-1)
-    return planes.view(like.dtype).reshape(1, *like.shape[1:])
-
-
 def write_fixed(group: h5py.Group, field: Field, values: AnyArray) -> None:
     """Create the dataset of a field from all of its rows (n, ...); no row can be added later.
 

@@ -287,24 +287,18 @@ def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rul
 # Groups and datasets
 
 
-def differences(
-    file: h5py.File, tables: Tables, *, image: int | None = None, thorough: bool = False
-) -> Iterator[Difference]:
+def differences(file: h5py.File, tables: Tables, *, thorough: bool = False) -> Iterator[Difference]:
     """Yield the differences between the groups and datasets of a file and the schema.
 
     Args:
         file: The file.
         tables: Fields of each group; the fields of the whole file are under "/".
-        image: Edge length of the images [px]; if None, the one that most datasets have.
         thorough: Whether to report harmless differences as well: additional fields, and other
             attributes of fields.
     """
     # The headers of all datasets; each is read once.
     headers = {name: _datasets(file, name, fields) for name, fields in tables.items()}
     lengths = _lengths(tables, headers)
-    if image is not None:
-        lengths["S"] = image
-
     if thorough:
         yield from _extras(file, tables)
     for name, fields in tables.items():

@@ -155,29 +155,19 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
         )
 
 
-def read_trials(
-    path: Path,
-    header: ShardHeader,
-    names: Sequence[str],
-    *,
-    verify_seal: bool = True,
-    complete: bool = False,
-) -> dict[str, AnyArray]:
+def read_trials(path: Path, header: ShardHeader, names: Sequence[str]) -> dict[str, AnyArray]:
     """Return some columns of a shard's `/trials`, by their names.
 
     Args:
         path: Path of the file.
         header: Identity that the shard must have.
         names: Names of the columns.
-        verify_seal: Whether to verify the seal, which reads the whole file.
-        complete: Whether all other fields must exist as well.
 
     Raises:
         DataError: See `read_shard`.
     """
     columns = tuple(f for f in trial_columns() if f.name in (*names, "outcome"))
-    tables = None if complete else {"trials": columns}
-    with open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
+    with open_shard(path, header, {"trials": columns}) as (file, _):
         refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
         return {name: read_column(file["trials"], name) for name in names}
 

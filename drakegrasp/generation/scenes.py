@@ -52,7 +52,7 @@ from drakegrasp.mesh.surfaces import even_points, on_faces, unit_normals
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.executor import Executor, in_order, run_here
-from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
+from drakegrasp.runtime.files import atomic_path, disk_full_named, new_hdf5
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Source
@@ -117,7 +117,11 @@ def make_scenes_locked(
     tasks, count = _tasks(out, manifest, trials), len(manifest.objects)
 
     rows, tables = Counter[str](), dict[str, list[Columns]]()
-    with disk_full_named(out), atomic_hdf5(out / SCENES_FILE) as file:
+    with (
+        disk_full_named(out),
+        atomic_path(out / SCENES_FILE) as temporary,
+        new_hdf5(temporary, sealed=True) as file,
+    ):
         # Copy the attributes of trials.hdf5 that state the origin of the data.
         origin = config, manifest.versions, manifest.fingers, manifest.joints
         file.attrs.update(origin_attributes(*origin))

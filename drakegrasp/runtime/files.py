@@ -116,8 +116,8 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
 
     Args:
         path: Path of the file.
-        sealed: Whether to reserve room for a seal and set it, see `seal`. A sealed file is built in
-            memory; other files may be larger than the memory.
+        sealed: Whether to reserve room for a seal and set it, see `seal`. Such a file is built in
+            memory; for one that may be larger, see `new_hdf5`.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -135,19 +135,26 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def new_hdf5(path: Path) -> Iterator[h5py.File]:
+def new_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
     """Open a new HDF5 file for the block to write; after an error the file is unusable.
+
+    Args:
+        path: Path of the file.
+        sealed: Whether to set a seal when the block ends, see `seal`, which reads the file again.
 
     Raises:
         OSError: If the file exists, the disk is full or the folder cannot be written.
     """
     with _PatientFile(path) as patient:
         try:
-            with h5py.File(patient, "w", libver=FORMAT) as file:
+            room = SEAL_SIZE if sealed else 0
+            with h5py.File(patient, "w", userblock_size=room, libver=FORMAT) as file:
                 yield file
         finally:
             # Other errors would follow from this one.
             patient.refuse_failure()
+    if sealed:
+        seal(path)
 
 
 class _PatientFile(FileIO):
@@ -216,18 +223,21 @@ def read_seal(path: Path) -> bytes:
         raise DataError(f"{path}: must be a complete shard, got none ({error.strerror})") from None
 
 
-def refuse_broken_seal(path: Path, what: str = "shard") -> None:
+def refuse_broken_seal(
+    path: Path, what: str = "shard", largest: int | None = LARGEST_SEALED
+) -> None:
     """Raise an error if any bit of a sealed file has changed.
 
     Args:
         path: Path of the file.
         what: What the file is, for the error message.
+        largest: As for `refuse_irregular`.
 
     Raises:
         DataError: If the file is damaged or missing.
     """
     try:
-        refuse_irregular(path, LARGEST_SEALED)
+        refuse_irregular(path, largest)
         with path.open("rb") as file:
             stored = file.read(SEAL_SIZE)
             intact = stored == _seal_of(file)

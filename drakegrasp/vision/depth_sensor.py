@@ -83,22 +83,6 @@ def spoil_depth(
     return spoilt
 
 
-def clean_depth(
-    depth: npt.NDArray[np.float32], sensor: DepthSensor, camera: int, config: DepthRange
-) -> npt.NDArray[np.float32]:
-    """Return a depth image (S, S) [m] without the noise of a sensor; lost depths stay lost.
-
-    It is the inverse of `spoil_depth` except for rounding: z' = z + a z^2 has the solution
-    z = 2 z' / (1 + sqrt(1 + 4 a z')), which is z' if a is 0.
-    """
-    if not sensor.noise:
-        return depth
-    a = sensor.noise * _normal(depth, sensor, camera)
-    noisy = depth.astype(float)
-    clean = 2.0 * noisy / (1.0 + np.sqrt(np.maximum(1.0 + 4.0 * a * noisy, 0.0)))
-    return np.where(_measured(depth, config), clean, depth).astype(np.float32)
-
-
 def shadow(depth: npt.NDArray[np.float32], K: Array, baseline: float) -> npt.NDArray[np.bool_]:
     """Return the pixels (S, S) of a depth image that the projector at +Cx does not light.
 

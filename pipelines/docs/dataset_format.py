@@ -61,8 +61,8 @@ It contains neither times nor names of machines, so equal files have equal cards
 
 A changed bit is detected when a file is read: `sha256` in the manifest is the hash of its other
 keys, shards and plans have a seal, and the HDF5 files store checksums of their columns and of the
-locations of these columns. Texts in HDF5 (names, attributes) have no checksum: `check` compares
-them.
+locations of these columns. Texts in HDF5 (names, attributes) have no checksum: the seals of the
+files cover them, which `check` verifies.
 
 Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/`, `hand/` and
 `manifest.json`, every trial can be replayed.
@@ -109,10 +109,11 @@ names the file and both versions: build the dataset again, in another directory.
 
 ## Seals
 
-Shards and the files in `objects/` are sealed: a changed bit in one of them is detected when the
-file is used, and by `drakegrasp check`. The three main files have no seal: `check` finds violations
-of an invariant, but not every changed bit of an image. `drakegrasp assemble` rebuilds them from the
-shards; a build does so by itself if they do not match the present shards and manifest. A list of
+A seal is the SHA-256 of a file, in its first 512 bytes, which HDF5 leaves free. Shards and the
+files in `objects/` are sealed: a changed bit in one of them is detected when the file is used. The
+three main files and `scenes.hdf5` are sealed, too; `drakegrasp check` verifies their seals, which
+reads the files as a whole. `drakegrasp assemble` rebuilds the three files from the shards; a build
+does so by itself if they do not match the present shards and manifest. A list of
 rejected trials (`assemble --reject`) is kept in the manifest until the next `assemble`.
 
 The three files and the manifest are replaced together: while `replacement.json` is in the directory

@@ -14,7 +14,7 @@ from helpers.datasets import SLIPPED, end_lift
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.card import card_content, card_text, content_of
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.outcomes import Outcome

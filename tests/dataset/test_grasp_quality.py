@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from click.testing import CliRunner
-from helpers.datasets import TRIALS, change, make_dataset, must_find, must_find_without_shards
+from helpers.datasets import TRIALS, change, make_dataset, must_find
 
 from drakegrasp.cli.main import main
 from drakegrasp.dataset import quality as module
@@ -190,20 +190,6 @@ def test_files_of_certified_builds_alone_have_the_columns(out: Path, tmp_path: P
         samples = GraspDataset(path / "grasping_oto.hdf5")
         assert samples[0].grasp_props["p_hold_repeats"] == (4 if there else 0)
         must_find(path)
-
-
-def test_repeats_are_checked(out: Path) -> None:
-    wrong = {
-        (0, "repeats"): (2, "p_hold_held must be at most p_hold_repeats"),
-        (3, "repeats"): (9, "p_hold_repeats must be at most"),
-        (12, "probability"): (1.5, "p_hold_probability must be above 0..1"),
-        (15, "half_step"): (0.5, "p_hold_half_step must be 0, 1 or NaN"),
-        (24, "held"): (2, "p_hold_samples must be at most p_hold_held"),
-    }
-    for (row, column), (value, _) in wrong.items():
-        change(out, TRIALS, f"trials/p_hold_{column}", row, lambda _, value=value: value)
-    found = [(TRIALS, "/trials", row, what) for (row, _), (_, what) in wrong.items()]
-    must_find_without_shards(out, *found)
 
 
 def columns_of(*rows: tuple[int, int, int, float]) -> dict[str, np.ndarray]:

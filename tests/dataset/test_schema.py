@@ -14,7 +14,7 @@ import pytest
 from helpers.datasets import OTM, OTO, TRIALS, edit_file, edit_manifest, make_dataset
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.opening import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, Tables
 from drakegrasp.dataset.paths import FILE_NAME

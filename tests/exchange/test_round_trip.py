@@ -24,7 +24,7 @@ from helpers.tiers import in_second_tier
 from scipy.spatial.transform import Rotation
 
 from drakegrasp import registry
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials

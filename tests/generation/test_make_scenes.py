@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from drakegrasp.cli.main import main
 from drakegrasp.dataset.card import card_content
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.errors import ConfigError

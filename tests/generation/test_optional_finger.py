@@ -10,7 +10,7 @@ from helpers.hands import write_with_optional_fingers
 from helpers.meshes import SMALL
 from helpers.objects import write_above
 
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.generation.replay import replay_trial

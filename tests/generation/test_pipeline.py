@@ -19,7 +19,7 @@ from helpers.tiers import few
 from drakegrasp.api.building import build_dataset
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard

@@ -16,7 +16,7 @@ from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 
 from drakegrasp.api.building import build_on
 from drakegrasp.config import Config
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.schema import NO_PRESHAPE

@@ -13,7 +13,7 @@ from helpers.meshes import SMALL
 
 from drakegrasp.api.verifying import verify_rows
 from drakegrasp.config import Config
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset

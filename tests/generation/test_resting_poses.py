@@ -16,7 +16,7 @@ from helpers.meshes import write_fixed
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials

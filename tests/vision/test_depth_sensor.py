@@ -7,7 +7,7 @@ import pytest
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.vision.camera import intrinsics
-from drakegrasp.vision.depth_sensor import DepthSensor, clean_depth, shadow, spoil_depth
+from drakegrasp.vision.depth_sensor import DepthSensor, shadow, spoil_depth
 
 CONFIG = CameraConfig()
 K, FAR = intrinsics(CONFIG), np.float32(CONFIG.far)
@@ -44,14 +44,6 @@ def test_noise_depends_on_seed_and_camera_alone() -> None:
     assert not np.array_equal(first, spoil_depth(depth, K, other, 0, CONFIG))
 
 
-def test_noise_can_be_taken_off_again() -> None:
-    depth = np.linspace(0.1, 0.74, CONFIG.size**2, dtype=np.float32).reshape(wall(0.1).shape)
-    spoilt = spoil_depth(depth, K, NOISY, 1, CONFIG)
-    assert np.abs(spoilt - depth).max() > 1e-3
-    measured = spoilt < FAR
-    assert np.abs(clean_depth(spoilt, NOISY, 1, CONFIG) - depth)[measured].max() < 2e-7
-
-
 def test_pixels_at_a_clipping_plane_have_no_depth_that_errs() -> None:
     depth = wall(CONFIG.far)
     depth[:50] = CONFIG.near
@@ -79,7 +71,6 @@ def test_wall_has_no_shadow_and_a_post_has_one_on_the_side_away_from_the_project
     spoilt = spoil_depth(depth, K, DepthSensor(noise=1e-3, baseline=baseline, seed=1), 0, CONFIG)
     assert np.array_equal(spoilt == FAR, hidden) and spoilt.dtype == np.float32
     assert spoil_depth(depth, K, DepthSensor(), 0, CONFIG) is depth
-    assert clean_depth(depth, DepthSensor(), 0, CONFIG) is depth
 
 
 def test_shadow_agrees_with_rays_from_the_projector() -> None:

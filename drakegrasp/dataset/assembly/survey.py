@@ -4,7 +4,7 @@ A task surveys the shards of one object: it verifies their seals, counts the row
 collects for each success the values that the filters need. From the surveys of all objects follows
 which successes are samples (by the rules of `filters`, user-defined filters, outliers and
 rejections), and in which split each sample is. `assembly.pack` packs the rows accordingly, and
-`assemble` writes them; `checks` decides again and compares.
+`assemble` writes them.
 """
 
 from __future__ import annotations
@@ -422,21 +422,18 @@ def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
     return {AttemptKey(manifest.objects[i].name, *key): t for i, *key, t in rows}
 
 
-def decide(
-    manifest: Manifest, shards: Shards, removed_by_own: npt.NDArray[np.bool_] | None = None
-) -> Decisions:
+def decide(manifest: Manifest, shards: Shards) -> Decisions:
     """Decide which successes are samples, and the split of each sample.
 
     Args:
         manifest: Manifest of the dataset, with filters, split and rejected attempts.
         shards: Rows and successes of the dataset's shards.
-        removed_by_own: As for `judge_successes`.
     """
     # Apply the filters.
     successes = shards.successes
     known = keys_of(manifest, successes)
     rejected = [known[key] for key in manifest.rejected if key in known]
-    removal = judge_successes(successes, manifest.config.filters, rejected, removed_by_own)
+    removal = judge_successes(successes, manifest.config.filters, rejected)
 
     # Split the samples.
     kept = np.flatnonzero(removal == Removal.KEPT)
@@ -514,19 +511,18 @@ def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[st
         seals: Hash of the seals of the shards, hexadecimal.
         camera: `oto` or `otm`; empty for the trials.
     """
-    own = {"camera": camera, "split_by": manifest.config.split.by} if camera else {}
+    lens, own = manifest.config.camera, dict[str, Any]()
+    if camera:
+        own = {"camera": camera, "split_by": manifest.config.split.by}
     return {
         **origin_attributes(manifest.config, manifest.versions, manifest.fingers, manifest.joints),
-        **lens_attributes(manifest.config.camera),
+        "K": intrinsics(lens),
+        "near": lens.near,
+        "far": lens.far,
         "signature": manifest.signature(),
         "shards": seals,
         **own,
     }
-
-
-def lens_attributes(camera: CameraConfig) -> dict[str, Any]:
-    """Return the attributes of a file that describe the cameras."""
-    return {"K": intrinsics(camera), "near": camera.near, "far": camera.far}
 
 
 #: The setting that names user-defined filters.
@@ -539,7 +535,6 @@ def judge_successes(
     successes: Table,
     config: FilterConfig,
     rejected: Sequence[int] = (),
-    removed_by_own: Flags | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Return the `Removal` (n,) of each success.
 
@@ -547,18 +542,13 @@ def judge_successes(
         successes: The n successes, with the columns of `dataset.assembly.survey`.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
-        removed_by_own: (n,), successes that user-defined filters remove; if None, the filters are
-            run here.
 
     Raises:
         ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
     """
-    if removed_by_own is None:
-        removed_by_own = _removed_by_own(config, successes)
-
     # Filters that judge each grasp by itself.
-    removal = first_removal(successes, config)
-    removal[removed_by_own & (removal == Removal.KEPT)] = Removal.OWN
+    removal, own = first_removal(successes, config), _removed_by_own(config, successes)
+    removal[own & (removal == Removal.KEPT)] = Removal.OWN
 
     # Outliers among the remaining grasps of an object that use the same fingers.
     kept = removal == Removal.KEPT

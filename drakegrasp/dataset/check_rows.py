@@ -1,0 +1,440 @@
+"""What `drakegrasp check` finds in rows: values by the table of fields, samples on their meshes.
+
+Input: a range of rows of one group of a file. Output: a `Violation` for each rule that some of them
+break. The rules come in stages, and a row that breaks a rule is left out of later stages: so the
+check reports a cause, and not everything that follows from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.hdf5 import AnyArray, read_rows, says_damage
+from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field
+from drakegrasp.dataset.trials import Stamp, Trials, reopened
+from drakegrasp.errors import DataError, MeshError, first_line, printable
+from drakegrasp.filters import Removal
+from drakegrasp.frames import (
+    X_WT,
+    Array,
+    invert_pose,
+    pack_pose,
+    rotate_vectors,
+    transform_points,
+    unpack_pose,
+)
+from drakegrasp.grasp import unused_fingers
+from drakegrasp.objects.model import fit_contacts, load_object
+from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.table import Table
+from drakegrasp.vision.camera import project
+
+#: float32 rounds points within one or two metres by 1e-7 m; this leaves room for products.
+POSITION_TOLERANCE = 1e-5  # [m]
+#: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
+UNIT_TOLERANCE = 1e-5
+#: How far a number may be from the number derived again, in units in the last place of the row's
+#: largest value: the last bit may differ between machines.
+LAST_PLACES = 2
+#: A contact on the object's outline may be rounded to a pixel beside the mask, and the collision
+#: mesh and `filters.max_surface_distance` allow it to be off the full mesh.
+MASK_TOLERANCE = 2.0  # [px]
+#: Columns that number the rows of another group, by their group; and columns of codes.
+NUMBERS: Mapping[str, Mapping[str, str]] = {
+    "trials": {"object": "objects"},
+    **{split: {"trial_id": "trials"} for split in SPLITS},
+    "successes": {"trial_id": "trials"},
+    "scenes": {"object": "objects"},
+    "views": {"scene": "scenes"},
+    "grasps": {"scene": "scenes"},
+    "visible": {"view": "views", "grasp": "grasps"},
+}
+CODES: Mapping[tuple[str, str], list[int]] = {
+    ("trials", "outcome"): [each.value for each in Outcome if not each.verification_only],
+    ("successes", "removal"): [each.value for each in Removal],
+}
+#: Groups whose rows have a value in every field from its stage on.
+COMPLETE = ("trials", *SPLITS, "scenes", "views")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Violation:
+    """One broken invariant.
+
+    Attributes:
+        file: Path within the dataset's directory.
+        group: Group or split within the file, e.g. `/train`; empty for the whole file.
+        row: First row of the group that breaks the invariant; None for all of it.
+        more: Number of further rows that break it.
+        what: The invariant in words, with its unit.
+        got: The value of the first row.
+    """
+
+    file: str
+    group: str = ""
+    row: int | None = None
+    more: int = 0
+    what: str
+    got: str
+
+    def __str__(self) -> str:
+        place = f"{self.file} {self.group}".strip()
+        row = "" if self.row is None else f" row {self.row}"
+        more = f" and {self.more:,} more" if self.more else ""
+        return f"{place}{row}{more}: {self.what}, got {self.got}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RowsTask:
+    """Some rows to check, in any process.
+
+    Attributes:
+        path: Path of the file, whose layout is that of the schema.
+        stamp: State of the file, see `drakegrasp.dataset.trials.stamp`.
+        group: Name of the group.
+        start, stop: Range of the rows.
+        fields: Fields of the group.
+        counts: Number of rows of the groups that the group's rows refer to, as far as known.
+        dataset: Manifest of the dataset around a data file whose samples are compared with their
+            trials and meshes; None to check the rows by themselves.
+    """
+
+    path: Path
+    stamp: Stamp
+    group: str
+    start: int
+    stop: int
+    fields: tuple[Field, ...]
+    counts: Mapping[str, int]
+    dataset: Manifest | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Rows:
+    """Rows n of a task that broke no rule so far.
+
+    Attributes:
+        of: The task.
+        numbers: (n,), numbers of the rows in their group.
+        columns: The columns that the group has, without images that have no limits.
+        attributes: Attributes of the file.
+    """
+
+    of: RowsTask
+    numbers: AnyArray
+    columns: Table
+    attributes: Mapping[str, Any]
+
+    def __getitem__(self, name: str) -> AnyArray:
+        return self.columns[name]
+
+    @property
+    def fields(self) -> Iterator[Field]:
+        """The fields that were read."""
+        return (f for f in self.of.fields if self.columns.has(f.name))
+
+    def where(self, keep: AnyArray) -> _Rows:
+        """Return the rows where `keep` (n,) is true."""
+        return _Rows(
+            of=self.of,
+            numbers=self.numbers[keep],
+            columns=self.columns[keep],
+            attributes=self.attributes,
+        )
+
+    @cached_property
+    def stage(self) -> AnyArray:
+        """The stage (n,) that each row reached; a sample reached the last one."""
+        if self.of.group != "trials":
+            return np.full(len(self.numbers), Stage.LIFTED.value)
+        reached = np.zeros(256, dtype=int)
+        reached[[each.value for each in Outcome]] = [each.stage.value for each in Outcome]
+        # The hand can touch the table while it closes, or in the lift.
+        late = (self["outcome"] == Outcome.TABLE_CONTACT) & np.isfinite(self["time_lift"])
+        return np.where(late, Stage.LIFTED.value, reached[self["outcome"]])
+
+    def touching(self, field: Field) -> AnyArray:
+        """Return which fingers (n, k) have a contact at the time of a field."""
+        if self.of.group == "trials":
+            return self["lifted_touching" if "lifted" in field.name else "closed_touching"]
+        return ~unused_fingers(self["grasp_props/unused"], self["grasps"].shape[1] // 6)
+
+    def pose(self, name: str) -> Array:
+        """Return the poses (n, 4, 4) in a field of a sample's `object_props`."""
+        return unpack_pose(self[f"object_props/{name}"].astype(float))
+
+    @cached_property
+    def X_CW(self) -> Array:
+        """The poses (n, 4, 4) of the world in the frame of the file's camera, of samples."""
+        return self.pose(f"frame_cam2work_{self.attributes['camera']}") @ invert_pose(X_WT)
+
+    @cached_property
+    def contacts(self) -> tuple[Array, Array]:
+        """p_CQ [m] and nhat_Q_C, (n, k, 3) each, of the closed hands of samples."""
+        vectors = self["grasps"].astype(float).reshape(len(self.numbers), 2, -1, 3)
+        return vectors[:, 0], vectors[:, 1]
+
+
+#: The words of a rule, the rows (n,) that break it, and what they have instead (n, ...).
+Finding: TypeAlias = tuple[str, AnyArray, AnyArray]
+#: A check of rows, which yields what it finds.
+RowCheck: TypeAlias = Callable[[_Rows], Iterator[Finding]]
+
+
+def check_rows(task: RowsTask) -> list[Violation]:
+    """Return the rules that some rows break.
+
+    Raises:
+        DataError: If the path now has another file.
+    """
+    name, group = task.path.name, f"/{task.group}"
+    with reopened(task.path, task.stamp, "a file of a dataset") as file:
+        try:
+            rows = _read(file, task)
+        except Exception as error:
+            if not says_damage(error):
+                raise
+            what = f"rows {task.start} to {task.stop - 1} must be readable"
+            return [Violation(file=name, group=group, what=what, got=first_line(error))]
+
+    stages: list[list[RowCheck]] = [[_numbers], [_complete, _limits], [_rigid, _derived]]
+    if task.group in SPLITS:
+        stages += [[_chain], [_in_mask]]
+        if task.dataset is not None:
+            stages += [[_of_sample], [_as_in_trials], [_on_mesh]]
+    found = list[Violation]()
+    for checks in stages:
+        sound = np.ones(len(rows.numbers), dtype=bool)
+        for what, bad, got in (each for check in checks if len(sound) for each in check(rows)):
+            if bad.any():
+                first, more = int(np.argmax(bad)), int(bad.sum()) - 1
+                row, said = int(rows.numbers[first]), _said(np.asarray(got)[first])
+                found.append(
+                    Violation(file=name, group=group, row=row, more=more, what=what, got=said)
+                )
+                sound &= ~bad
+        rows = rows.where(sound)
+    return found
+
+
+def _read(file: Any, task: RowsTask) -> _Rows:
+    """Read the rows of a task."""
+    own, choice = file[task.group], slice(task.start, task.stop)
+    # The seal proves that images are intact, and no rule here is about their colours and depths.
+    fields = (f for f in task.fields if f.name in own and not (f.sample and f.limits is None))
+    return _Rows(
+        of=task,
+        numbers=np.arange(task.start, task.stop),
+        columns=Table({f.name: read_rows(own, f, choice) for f in fields}),
+        attributes=dict(file.attrs),
+    )
+
+
+def _said(value: Any) -> str:
+    """Return the value of a row in a line."""
+    number = isinstance(value, float | np.floating)
+    return f"{value:.6g}" if number else printable(" ".join(str(value).split())[:60])
+
+
+def _any(values: AnyArray) -> AnyArray:
+    """Return for each row (n,) whether any of its values (n, ...) is true."""
+    return np.asarray(values.any(axis=tuple(range(1, values.ndim))))
+
+
+# What the table of fields says of any group
+
+
+def _numbers(rows: _Rows) -> Iterator[Finding]:
+    """Numbers of rows are those of rows, and codes have a meaning."""
+    group, counts = rows.of.group, rows.of.counts
+    if group == "trials":
+        values = rows["trial_id"]
+        yield "trial_id must be the number of the row", values != rows.numbers, values
+    for name, of in NUMBERS.get(group, {}).items():
+        values = rows[name]
+        bad = _any((values < 0) | (values >= counts.get(of, np.inf)))
+        yield f"{name} must be one of the rows of /{of}", bad, values
+    for (place, name), known in CODES.items():
+        if place == group:
+            what = f"{name} must be one of {', '.join(map(str, known))}"
+            yield what, ~np.isin(rows[name], known), rows[name]
+
+
+def _complete(rows: _Rows) -> Iterator[Finding]:
+    """Fields have values from their stage on, and no values before it."""
+    for f in rows.fields if rows.of.group in COMPLETE else ():
+        values, reached, since = rows[f.name], rows.stage >= f.stage, f.stage.name.lower()
+        if f.derive is not None or f.dtype == "str":
+            continue  # see `_derived`
+
+        # What a value must be depends on its kind.
+        if not f.dtype.startswith("float"):
+            bad = ~reached & _any(values != 0)
+            yield f"{f.name} must be 0 before the stage {since}", bad, values
+        elif f.some:
+            bad = ~reached & _any(~np.isnan(values))
+            yield f"{f.name} must be NaN before the stage {since}", bad, values
+        else:
+            late = f.stage is not Stage.PLACED
+            due, where = reached, f"from the stage {since} on and NaN before" if late else "always"
+            if f.per_finger or f.axes == ("6k",):
+                due = reached[:, None] & rows.touching(f)
+                where = "where the finger touches and NaN elsewhere"
+            if f.axes == ("6k",):
+                due = np.tile(np.repeat(due, 3, axis=1), 2)
+            due = due.reshape(*due.shape, *(1,) * (values.ndim - due.ndim))
+            bad = _any(np.where(due, ~np.isfinite(values), ~np.isnan(values)))
+            yield f"{f.name} must be finite {where}", bad, values
+
+
+def _limits(rows: _Rows) -> Iterator[Finding]:
+    """Values are within the limits of their fields; NaN has no limits."""
+    for f in rows.fields:
+        if f.limits is not None:
+            # A limit is rounded as the values are: in float32, pi is above its double value.
+            values = rows[f.name].reshape(len(rows.numbers), -1)
+            low, high = (values.dtype.type(limit) for limit in f.limits)
+            positive = f.limits[0] == POSITIVE
+            what = f"above 0..{high:.4g}" if positive else f"{low:g}..{high:.4g}"
+            bad = (values < low) | (values > high) | (positive & (values <= 0))
+            worst = values[range(len(values)), bad.argmax(axis=1)]
+            yield f"{f.name} must be {what}", bad.any(axis=1), worst
+
+
+def _rigid(rows: _Rows) -> Iterator[Finding]:
+    """Poses are rigid motions, and normals have length one; NaN means that there is no value."""
+    count = len(rows.numbers)
+    for f in rows.fields:
+        if f.axes[-1:] == (12,):
+            R = unpack_pose(rows[f.name].astype(float)).reshape(count, -1, 4, 4)[..., :3, :3]
+            R = np.where(np.isfinite(R).all(axis=(2, 3), keepdims=True), R, np.eye(3))
+            off = np.abs(np.swapaxes(R, 2, 3) @ R - np.eye(3)).max(axis=(1, 2, 3))
+            bad = (off > UNIT_TOLERANCE) | (np.linalg.det(R).min(axis=1) < 0.0)
+            what = f"{f.name} must have an orthonormal rotation with determinant +1"
+            yield what, bad, rows[f.name].reshape(count, -1)
+        elif f.axes == ("6k",) or (f.axes == ("k", 3) and "nhat" in f.name):
+            # In a grasp the normals come after the points.
+            n = rows[f.name].astype(float).reshape(count, -1, 3)
+            n = n[:, n.shape[1] // 2 :] if f.axes == ("6k",) else n
+            length = np.linalg.norm(n, axis=2)
+            bad = (np.abs(length - 1.0) > UNIT_TOLERANCE).any(axis=1)
+            yield f"normals in {f.name} must have length 1", bad, length
+
+
+def _derived(rows: _Rows) -> Iterator[Finding]:
+    """Derived fields have the values that the schema derives from other fields."""
+    for f in rows.fields:
+        if f.derive is not None and rows.columns.has(*f.needs):
+            what = f"{f.name} must follow from {', '.join(f.needs)}"
+            yield what, _differs(rows[f.name], f.derive(rows.columns)), rows[f.name]
+
+
+def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) -> AnyArray:
+    """Return (n,) whether values (n, ...) differ from the values derived again.
+
+    Args:
+        values: The stored values.
+        due: The values derived again, of any type.
+        tolerance: Maximum difference of a number; `LAST_PLACES` of rounding if None.
+    """
+    due = due.astype(values.dtype, copy=False).reshape(values.shape)
+    if values.dtype.kind != "f":
+        return _any(values != due)
+    same = (values == due) | (np.isnan(values) & np.isnan(due))
+    size = np.abs(np.where(np.isfinite(due), due, 0.0)).reshape(len(due), -1).max(axis=1)
+    limit = LAST_PLACES * np.spacing(size) if tolerance is None else np.full(len(due), tolerance)
+    with np.errstate(invalid="ignore"):
+        near = np.abs(values - due) <= limit.reshape(-1, *(1,) * (values.ndim - 1))
+    return _any(~(same | near))
+
+
+# What samples are
+
+
+def _chain(rows: _Rows) -> Iterator[Finding]:
+    """The frames of a sample agree: the table, and both cameras with their inverses."""
+    what = f"frame_world2work must be the identity at {X_WT[:3, 3].tolist()} m"
+    apart = {what: rows.pose("frame_world2work") - X_WT}
+    for camera in CAMERAS:
+        names = f"frame_work2cam_{camera}", f"frame_cam2work_{camera}"
+        X_TC, X_CT = map(rows.pose, names)
+        apart[f"{names[0]} times {names[1]} must be the identity"] = X_TC @ X_CT - np.eye(4)
+    oto, otm = (rows.pose(f"frame_work2cam_{camera}")[:, :3, 2:] for camera in CAMERAS)
+    apart["both cameras must have the same place and view"] = oto - otm
+    for what, difference in apart.items():
+        off = np.abs(difference).max(axis=(1, 2))
+        yield what, off > POSITION_TOLERANCE, off
+
+
+def _of_sample(rows: _Rows) -> Iterator[Finding]:
+    """The trial of a sample is a success that no filter removes."""
+    kept = Trials(rows.of.path.parent)[rows["trial_id"]]["removal"] == Removal.KEPT
+    yield "trial_id must be that of a sample", ~kept, rows["trial_id"]
+
+
+def _as_in_trials(rows: _Rows) -> Iterator[Finding]:
+    """A sample repeats the numbers of its trial, and its poses follow from those of the trial."""
+    copied = {f.name: f.of for f in rows.fields if f.of}
+    trials = Trials(rows.of.path.parent)[rows["trial_id"]]
+    own = Table(trials.columns([*copied.values(), "X_TO", "X_OG"]))
+    for name, of in copied.items():
+        yield f"{name} must follow from its trial", _differs(rows[name], own[of]), rows[name]
+
+    X_WO = multiply(X_WT, unpack_pose(own["X_TO"]))
+    X_CG = rows.X_CW @ X_WO @ unpack_pose(own["X_OG"])
+    poses = {"object_props/frame_world2obj": X_WO, "grasp_props/X_CG": X_CG}
+    for name, due in poses.items():
+        bad = _differs(rows[name], pack_pose(due), POSITION_TOLERANCE)
+        yield f"{name} must follow from its trial", bad, rows[name]
+
+
+def _in_mask(rows: _Rows) -> Iterator[Finding]:
+    """Contacts are before the camera, and project onto the object in the image."""
+    (p_CQ, _), K = rows.contacts, rows.attributes["K"]
+    off = np.zeros(p_CQ.shape[:2])
+    for i, mask in enumerate(rows["masks"]):
+        used, seen = np.isfinite(p_CQ[i]).all(axis=1), np.argwhere(mask)[:, ::-1]
+        apart = np.linalg.norm(project(K, p_CQ[i, used])[:, None] - seen, axis=2)
+        off[i, used] = apart.min(axis=1, initial=np.inf)
+    off[p_CQ[..., 2] <= 0.0] = np.inf
+    what = f"contacts must project within {MASK_TOLERANCE:g} px of the mask"
+    yield what, np.any(off > MASK_TOLERANCE, axis=1), off
+
+
+def _on_mesh(rows: _Rows) -> Iterator[Finding]:
+    """Contacts are on the object's mesh, and their normals point out of it.
+
+    A normal counts as outward if it agrees with either of the faces of `ContactFit.normal_angle`.
+    """
+    assert rows.of.dataset is not None
+    limit = rows.of.dataset.config.filters.max_surface_distance
+    X_OC = invert_pose(rows.X_CW @ rows.pose("frame_world2obj"))
+    p_CQ, nhat_Q_C = rows.contacts
+    off, angle = np.zeros((2, *p_CQ.shape[:2]))
+
+    # Object by object.
+    names = rows["object_props/object_name"]
+    for name in np.unique(names.astype(str)).tolist():
+        try:
+            model = load_object(model_path(rows.of.path.parent, name))
+        except (DataError, MeshError):
+            continue  # a violation of the object's files
+        for i in np.flatnonzero(names == name).tolist():
+            p_OQ = transform_points(X_OC[i], p_CQ[i])
+            fit = fit_contacts(model, p_OQ, rotate_vectors(X_OC[i], nhat_Q_C[i]))
+            off[i], angle[i] = fit.distance, np.degrees(fit.normal_angle)
+
+    beyond = off > limit + POSITION_TOLERANCE
+    what = f"contacts must be on the object's mesh within {limit:g} m"
+    yield what, beyond.any(axis=1), off
+    what = "normals must point out of the object, within 90 deg of its face's"
+    yield what, ((angle > 90.0) & ~beyond).any(axis=1), angle

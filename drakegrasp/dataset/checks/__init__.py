@@ -1,1 +1,0 @@
-"""Every invariant of a dataset, and what breaks it."""

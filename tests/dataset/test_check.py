@@ -1,0 +1,356 @@
+"""The check of files: what passes, what is missing, damaged, of another state or layout."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import (
+    OTM,
+    OTO,
+    TRIALS,
+    change,
+    edit_file,
+    edit_manifest,
+    found,
+    make_dataset,
+    must_find,
+    set_at,
+)
+from helpers.physics import broken_physics
+
+from drakegrasp.dataset import check
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.check import check_dataset
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
+from drakegrasp.dataset.paths import model_path, plan_path
+from drakegrasp.dataset.shards import read_shard, write_shard
+from drakegrasp.errors import DataError
+from drakegrasp.generation.scenes import make_scenes
+from drakegrasp.hand.settings import override_config
+from drakegrasp.objects.model import load_object, save_object
+from drakegrasp.runtime.executor import processes
+
+T, R = TypeVar("T"), TypeVar("R")
+FILES = (OTO, OTM, TRIALS)
+#: Everything is drawn. Small turns: the boxes' contacts stay in view.
+DRAWN = (
+    *("randomize.object_colour=1", "randomize.table_colour=1", "randomize.light_angle_deg=60"),
+    *("randomize.light_strength=[0.2,1.5]", "randomize.camera_shift=0.005"),
+    *("randomize.camera_turn_deg=2", "randomize.depth_noise=[0.002,0.004]"),
+    *("randomize.depth_baseline=0.02", "randomize.friction_hand=[0.7,1.3]"),
+    *("randomize.friction_table=[0.7,1.3]", "randomize.mass=[0.5,1.5]"),
+)
+AS_WRITTEN = "the file must be as it was written"
+
+
+@pytest.mark.parametrize(
+    "overrides", [None, ["split.by=class"], ["close.scrape_depth=null"], DRAWN]
+)
+def test_a_sound_dataset_passes(sound: Path, tmp_path: Path, overrides: list[str] | None) -> None:
+    out = sound
+    if overrides is not None:
+        out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=overrides)
+    assert check_dataset(out) == []
+    assert broken_physics(out) == {}
+    for name in FILES:
+        shutil.copy(out / name, tmp_path / "renamed.h5")
+        assert check_dataset(tmp_path / "renamed.h5") == []
+
+
+def test_progress_ends_at_the_total(sound: Path) -> None:
+    seen: list[tuple[int, int | None]] = []
+    check_dataset(sound, progress=lambda done, total, **_: seen.append((done, total)))
+    assert seen == [(done, len(seen)) for done in range(1, len(seen) + 1)]
+
+
+@pytest.mark.nightly
+def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small tasks, with faults in the first and the last rows, in an object and in a shard."""
+    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
+    model_path(out, "1_box_a").write_bytes(b"")
+    edit_file(out / TRIALS, lambda f: f["trials/object"].__setitem__(35, 9))
+    for name in (OTO, OTM):
+        edit_file(out / name, lambda f: f["test/grasps"].__setitem__((-1, 0), np.nan))
+    expected = check_dataset(out)
+    assert {(v.file, v.group) for v in expected} == {
+        ("objects/1_box_a.npz", ""),
+        ("shards/2_box_b/0000002-0000004.h5", ""),
+        (TRIALS, "/trials"),
+        *((name, "/test") for name in (OTO, OTM)),
+    }
+
+    monkeypatch.setattr(check, "TASK_ROWS", 7)
+    assert check_dataset(out) == expected
+    assert check_dataset(out, execute=backwards) == expected
+    with processes(2) as execute:
+        assert check_dataset(out, execute=execute) == expected
+
+
+def backwards(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Run as workers may: the last item is done first."""
+    return map(function, reversed(list(items)))
+
+
+def test_file_that_is_replaced_meanwhile_is_one_error(out: Path) -> None:
+    def replacing(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        for item in items:
+            shutil.copy(out / OTO, out / "copy")
+            (out / "copy").replace(out / OTO)
+            yield function(item)
+
+    with pytest.raises(DataError, match=r"_oto.hdf5: must stay while it is read, got another"):
+        check_dataset(out, execute=replacing)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_seal_of_a_file_finds_one_changed_bit(out: Path, name: str) -> None:
+    """Here in an image of a sample, or in the friction of an attempt, which no rule is about."""
+    column = "trials/friction_hand" if name == TRIALS else "train/images"
+    with h5py.File(out / name) as file:
+        chunk = file[column].id.get_chunk_info(0)
+    content = bytearray((out / name).read_bytes())
+    content[chunk.byte_offset + chunk.size // 2] ^= 1
+    (out / name).write_bytes(content)
+    for path in (out, out / name):
+        assert (name, "", None, AS_WRITTEN) in found(path)
+
+
+def test_a_value_that_was_edited_is_found(out: Path) -> None:
+    """Without a new seal."""
+    with h5py.File(out / OTO, "r+") as file:
+        file["train/images"][0, 0, 0, 0] = 0.25
+    must_find(out, (OTO, "", None, AS_WRITTEN))
+
+
+def test_files_of_other_shards_are_found(out: Path) -> None:
+    """A shard that is whole, and not the one that the files were made from."""
+    header = next(read_manifest(out).headers())
+    shard = read_shard(header.path(out), header)
+    slip = np.array(shard.trials["slip"])
+    slip[np.isfinite(slip)] += 1e-3
+    write_shard(out, replace(shard, trials={**shard.trials, "slip": slip}))
+    what = "attribute shards must be that of the shards that are there"
+    must_find(out, *((name, "", None, what) for name in FILES))
+
+
+def test_files_are_of_the_manifests_configuration(out: Path) -> None:
+    manifest = read_manifest(out)
+    config = override_config(manifest.config, ["split.valid_fraction=0.3"])
+    write_manifest(replace(manifest, config=config), out)
+    what = "attribute signature must be that of manifest.json"
+    must_find(out, *((name, "", None, what) for name in FILES))
+    config = override_config(manifest.config, ["verify.max_contact_error=0.02"])
+    write_manifest(replace(manifest, config=config), out)
+    must_find(out)
+
+
+def test_a_group_of_objects_in_two_splits_is_reported(out: Path) -> None:
+    assemble(out, overrides=["split.by=object"])
+    assert not found(out)
+    homes = {entry.split: entry.name for entry in read_manifest(out).objects}
+    assert {*homes} == {"train", "valid", "test"}
+
+    def join(tree: dict[str, Any]) -> None:
+        for entry in tree["objects"]:
+            if entry["name"] in (homes["train"], homes["valid"]):
+                entry["group"] = "one"
+
+    edit_manifest(out, join)
+    (violation,) = (v for v in check_dataset(out) if v.file == "manifest.json")
+    assert str(violation) == (
+        "manifest.json: objects of one group must be in one split, got them in "
+        f"{' and '.join(e.split or '' for e in read_manifest(out).objects if e.group)}"
+    )
+
+
+def test_file_with_a_link_hides_no_other_fault(out: Path) -> None:
+    edit_file(out / OTM, lambda f: f.__setitem__("link", h5py.SoftLink("/train")))
+    change(out, OTO, "train/masks", 0, set_at(0, 0, to=2))
+    must_find(
+        out,
+        (OTM, "", None, "the file must be there, readable"),
+        (OTO, "/train", 0, "masks must be 0..1"),
+    )
+
+
+def test_a_truncated_file_is_found_and_the_others_are_still_checked(out: Path) -> None:
+    content = (out / OTM).read_bytes()
+    (out / OTM).write_bytes(content[: len(content) // 2])
+    change(out, OTO, "train/masks", 0, set_at(0, 0, to=2))
+    must_find(
+        out,
+        (OTM, "", None, "the file must be there, readable"),
+        (OTO, "/train", 0, "masks must be 0..1"),
+    )
+    with pytest.raises(DataError, match="cannot be read"):
+        check_dataset(out / OTM)
+
+
+def test_a_missing_file_is_found_and_the_others_are_still_checked(out: Path) -> None:
+    (out / TRIALS).unlink()
+    must_find(out, (TRIALS, "", None, "the file must be there, readable"))
+
+
+def test_rows_that_cannot_be_read_are_found(out: Path) -> None:
+    with h5py.File(out / OTO) as file:
+        offset = file["train/object_props/work2mass"].id.get_chunk_info(0).byte_offset
+    with open(out / OTO, "r+b") as raw:
+        raw.seek(offset)
+        raw.write(b"\xff" * 64)
+    what = "rows 0 to 2 must be readable"
+    must_find(out, (OTO, "", None, AS_WRITTEN), (OTO, "/train", None, what))
+
+
+def test_any_path_of_a_dataset_may_have_faults(out: Path, tmp_path: Path) -> None:
+    odd = Path(shutil.copytree(out, tmp_path / "a: b, got c" / "out"))
+    model_path(odd, "1_box_a").unlink()
+    plan_path(odd, "2_box_b").write_bytes(b"")
+    places = {v.file: v.got for v in check_dataset(odd)}
+    assert {"objects/1_box_a.npz", "objects/2_box_b.plan.h5"} <= set(places)
+    assert "a: b" not in places["objects/2_box_b.plan.h5"]
+
+
+def test_each_file_of_an_object_is_checked(out: Path) -> None:
+    """Shards that are damaged or of another unit, meshes, and a flipped bit in a plan."""
+    damaged, other = ("shards/1_box_a/0000000-0000002.h5", "shards/2_box_b/0000000-0000002.h5")
+    for path in (out / damaged, plan_path(out, "2_box_b")):
+        content = bytearray(path.read_bytes())
+        content[-100] ^= 1
+        path.write_bytes(content)
+    shard = read_shard(out / other)
+    write_shard(out, replace(shard, header=replace(shard.header, mesh_sha256="0")))
+    model_path(out, "3_brick").unlink()
+    box = load_object(model_path(out, "1_box_a"))
+    save_object(replace(box, mesh_sha256="0"), model_path(out, "1_box_a"))
+
+    written, whole = "the meshes must be as they were written", "the shard must be there, whole"
+    of_manifest = "the meshes must be those of manifest.json"
+    violations = {(v.file, v.what): v.got for v in check_dataset(out) if v.file not in FILES}
+    assert violations.keys() == {
+        *((path, f"{whole} and of its work unit") for path in (damaged, other)),
+        ("objects/2_box_b.plan.h5", "the plan must be as it was written"),
+        *((f"objects/{name}.npz", written) for name in ("1_box_a", "3_brick")),
+        *((f"objects/{name}.npz", of_manifest) for name in ("1_box_a", "3_brick")),
+    }
+    assert "damaged or cut off" in violations[damaged, f"{whole} and of its work unit"]
+
+
+def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"without manifest\.json"):
+        check_dataset(tmp_path)
+    with pytest.raises(DataError, match="must be the directory"):
+        check_dataset(tmp_path / "missing.hdf5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = [1, 2]
+    with pytest.raises(DataError, match="another HDF5 file"):
+        check_dataset(tmp_path / "other.h5")
+
+
+def test_rows_that_break_one_rule_are_counted(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lose(file: h5py.File) -> None:
+        file["trials/spread"][...] = np.nan
+
+    monkeypatch.setattr(check, "TASK_ROWS", 10)
+    edit_file(out / TRIALS, lose)
+    (violation,) = check_dataset(out / TRIALS)
+    assert str(violation) == (
+        "trials.hdf5 /trials row 0 and 35 more: spread must be finite always, got nan"
+    )
+
+
+def retype(file: h5py.File) -> None:
+    values, attrs = file["valid/masks"][:], dict(file["valid/masks"].attrs)
+    del file["valid/masks"]
+    file["valid/masks"] = values.astype(np.int32)
+    file["valid/masks"].attrs.update(attrs)
+
+
+LAYOUT_CASES: Mapping[str, tuple[str, Callable[[h5py.File], Any], str, str]] = {
+    "extra group": (OTO, lambda f: f.create_group("more"), "", "groups must be those of"),
+    "no group": (OTO, lambda f: f.pop("valid"), "/valid", "the group must be there"),
+    "extra dataset": (
+        OTO,
+        lambda f: f.create_dataset("valid/object_props/x", data=[0]),
+        "/valid",
+        "datasets must be those of the schema",
+    ),
+    "no dataset": (OTM, lambda f: f.pop("valid/masks"), "/valid/masks", "the dataset must be"),
+    "rows": (OTO, lambda f: f["valid/masks"].resize(2, 0), "/valid/masks", "shape must be (3, 32"),
+    "type": (OTO, retype, "/valid/masks", "type must be uint8"),
+    "unit": (
+        OTO,
+        lambda f: f["valid/grasps"].attrs.update(unit="mm"),
+        "/valid/grasps",
+        "attribute unit must be 'm, -'",
+    ),
+    "frame": (
+        TRIALS,
+        lambda f: f["trials/slip"].attrs.update(frame="W"),
+        "/trials/slip",
+        "attribute frame must be 'G'",
+    ),
+    "meaning": (
+        TRIALS,
+        lambda f: f["trials/slip"].attrs.pop("meaning"),
+        "/trials/slip",
+        "attribute meaning must be there",
+    ),
+    "schema": (OTO, lambda f: f.attrs.update(schema_version=0), "", "the file must be there"),
+    "near": (OTO, lambda f: f.attrs.pop("near"), "", "attribute near must be a positive"),
+    "config": (OTO, lambda f: f.attrs.update(config="{"), "", "attribute config must be a mapp"),
+    "versions": (OTO, lambda f: f.attrs.update(versions="1"), "", "attribute versions must be a"),
+    "K": (
+        OTO,
+        lambda f: f.attrs.update(K=f.attrs["K"] + 1e-3),
+        "",
+        "attribute K must be that of its config",
+    ),
+    "far": (OTO, lambda f: f.attrs.update(far=1.0), "", "attribute far must be that of its"),
+    "seed": (TRIALS, lambda f: f.attrs.update(seed=5), "", "attribute seed must be that of"),
+    "hash": (TRIALS, lambda f: f.attrs.update(config_hash="0"), "", "attribute config_hash must"),
+    "camera": (OTO, lambda f: f.attrs.update(camera="otm"), "", "attribute camera must be that"),
+    "split": (OTO, lambda f: f.attrs.update(split_by="class"), "", "attribute split_by must be"),
+}
+
+
+#: What a file by itself does not show.
+OF_DATASET = ("schema", "camera", "split")
+
+
+@pytest.mark.parametrize("case", LAYOUT_CASES)
+def test_a_wrong_layout_or_attribute_is_found(out: Path, case: str) -> None:
+    name, edit, group, what = LAYOUT_CASES[case]
+    edit_file(out / name, edit)
+    must_find(out if case in OF_DATASET else out / name, (name, group, None, what))
+
+
+@pytest.mark.sim
+def test_scenes_are_checked(out: Path) -> None:
+    make_scenes(out, overrides=["scenes.views=2"])
+    must_find(out)
+    path, name = out / "scenes.hdf5", "scenes.hdf5"
+    must_find(path)
+
+    def spoil(file: h5py.File) -> None:
+        file["scenes/split"][0] = 3
+        file["views/scene"][1] = 99
+        file["views/X_TC"][0] = 1.1 * file["views/X_TC"][0]
+
+    edit_file(path, spoil)
+    spoilt = [
+        (name, "/scenes", 0, "split must be 0..2"),
+        (name, "/views", 1, "scene must be one of the rows of /scenes"),
+        (name, "/views", 0, "X_TC must have an orthonormal rotation"),
+    ]
+    must_find(out, *spoilt)
+    with h5py.File(path, "r+") as file:
+        file.attrs["shards"] = "0" * 64
+    other = (name, "", None, "attribute shards must be that of the shards that are there")
+    must_find(out, *spoilt, other, (name, "", None, AS_WRITTEN))
