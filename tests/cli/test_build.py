@@ -224,7 +224,7 @@ def test_files_of_two_states_are_a_finding(out: Path) -> None:
     (out / OTM).write_bytes(old)
     result = run("check", out)
     assert result.exit_code == 1
-    assert f"{OTM}: attribute config must be that of manifest.json" in result.stdout
+    assert f"{OTM}: attribute signature must be that of manifest.json" in result.stdout
 
 
 def _crash(*arguments: object) -> TrialRecord:
