@@ -624,7 +624,8 @@ class SceneRows(GraspDataset):
         views = data.tables["views"]
         scene = views["scene"][self.views]
         objects = data.tables["scenes"]["object"][scene, 0]
-        trial = trials[ids].columns(("X_TO", "mass", "friction_hand", "friction_table"))
+        needed = ("X_TO", "X_OG", "mass", "friction_hand", "friction_table")
+        trial = trials[ids].columns(needed)
         # The pose that the camera would have if the object had stayed where it rested.
         X_TO = unpack_pose(trial["X_TO"])
         X_OC = multiply(
@@ -635,6 +636,7 @@ class SceneRows(GraspDataset):
             "grasps": packed,
             "trial_id": ids,
             "grasp_props/resting": data.tables["scenes"]["resting"][scene, 0],
+            "grasp_props/X_CG": pack_pose(multiply(invert_pose(X_OC), unpack_pose(trial["X_OG"]))),
             "object_props/object_name": np.array(data.names, dtype=object)[objects],
             "object_props/class_name": np.array(data.classes, dtype=object)[objects],
             "object_props/work2mass": trial["mass"][:, None],

@@ -15,8 +15,9 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes import SceneRows, open_rows
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
-from drakegrasp.frames import transform_points
+from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.generation.scenes import make_scenes
+from drakegrasp.scoring.benchmark import rows_digest
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.run import own_contacts
 from drakegrasp.simulation.attempts import Attempts
@@ -52,6 +53,18 @@ def test_own_grasps_come_back_to_the_contacts_of_their_trials(path):
     np.testing.assert_allclose(found, due["closed_p_OQ"][order], atol=1e-6)
     own = np.array(own_contacts(rows, range(len(rows)))).reshape(-1, 3, 3)
     np.testing.assert_allclose(own, due["closed_p_OQ"], atol=1e-6)
+
+
+def test_palms_of_the_own_grasps_are_those_of_their_trials(path):
+    rows = SceneRows(path, split="test")
+    due = Trials(path.parent)[rows.column("trial_id")].columns(("X_OG", "closed_p_OQ"))
+    X_GC = invert_pose(unpack_pose(rows.column("grasp_props/X_CG")))
+    X_GO = invert_pose(unpack_pose(due["X_OG"]))
+    for row, grasp in enumerate(rows.column("grasps")):
+        p_GQ = transform_points(X_GO[row], due["closed_p_OQ"][row])
+        found = transform_points(X_GC[row], grasp[:9].reshape(3, 3))
+        np.testing.assert_allclose(found, p_GQ, atol=1e-5)
+    assert len(rows_digest(rows, range(len(rows)))) == 64
 
 
 def test_images_show_the_object_where_the_grasp_is(path):
