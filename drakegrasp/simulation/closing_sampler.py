@@ -154,7 +154,8 @@ class Closing:
         if not palms:
             return None
 
-        # Directions take turns, of these sides, and of these palms the best one is the next.
+        # The next palm comes from the direction with the fewest palms so far; among equal ones from
+        # the side with the fewest; and among these it is the one that closes best.
         before, cells = self._cells(self._order), self._cells(palms)
         turns = [
             (before.count(cell), counts[palm.side], -palm.score)
