@@ -357,28 +357,12 @@ class LiftConfig(_Section):
     stop_turn_deg: Annotated[Positive, _STOPS] = 10.0  # of the object since its release
 
 
-class CertifyConfig(_Section):
-    """How much disturbance lifted attempts tolerate; see docs/explanation/physics.md."""
+class RobustnessConfig(_Section):
+    """Repeats of samples with noise; see docs/explanation/physics.md."""
 
-    repeats: NonNegativeCount = 0  # disturbed lifts of each selected attempt; 0: none
+    repeats: NonNegativeCount = 0  # disturbed lifts of each selected sample; 0: none
     # Probability that a sample (by the default filters) is selected.
     share: Share = 1.0
-    # Probability that any other lifted attempt is selected.
-    share_others: Share = 0.0
-    # Probability that a sample is selected if a split by object is likely to use its object for
-    # testing or validation; the larger of this value and `share` is used.
-    share_tested: Share = 0.0
-    palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
-    palm_noise_deg: NonNegative = 1.0  # standard deviation about each axis of the palm
-    friction_noise: NonNegative = 0.1  # standard deviation of the coefficient's logarithm
-    mass_noise: NonNegative = 0.1  # standard deviation of the mass's logarithm
-    # Bisection steps for the smallest friction of successes; 0: it is not determined.
-    friction_steps: Annotated[int, Field(ge=0, le=16)] = 4
-
-    @property
-    def certified(self) -> bool:
-        """Whether files store the disturbance that attempts tolerate (`schema.HOLD_FIELDS`)."""
-        return self.repeats > 0
 
 
 class CameraConfig(_Section):
@@ -585,8 +569,9 @@ class Config(_Section):
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
-    # Without repeats the noise is not used.
-    certify: Annotated[CertifyConfig, Decides(shards=lambda _, it: it.repeats)] = CertifyConfig()
+    robustness: Annotated[RobustnessConfig, Decides(shards=lambda _, it: it.repeats)] = (
+        RobustnessConfig()
+    )
     camera: CameraConfig = CameraConfig()
     randomize: Annotated[RandomizeConfig, _counts_unless(RandomizeConfig())] = RandomizeConfig()
     scenes: Annotated[ScenesConfig, NO_SHARD, _told_unless(ScenesConfig())] = ScenesConfig()
@@ -641,11 +626,6 @@ class Config(_Section):
         inverse.
         """
         return self.tree()
-
-    @property
-    def certified(self) -> bool:
-        """Whether files store the disturbance that attempts tolerate (`schema.HOLD_FIELDS`)."""
-        return self.certify.certified
 
     @property
     def has_target(self) -> bool:

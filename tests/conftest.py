@@ -15,7 +15,7 @@ from unittest.mock import Mock
 
 import pytest
 import trimesh
-from helpers.datasets import CERTIFIED, make_dataset
+from helpers.datasets import REPEATED, make_dataset
 from helpers.golden import Golden, compare
 from helpers.meshes import G3DB, SMALL, write_fixed
 from helpers.objects import CUBE, box_model
@@ -127,10 +127,10 @@ def small_dataset(
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset that nobody simulated: nine successes of 36 attempts on three boxes. Read only.
 
-    Its lifts are certified, so that it has all columns that there are.
+    Its samples are repeated, so that it has all columns that there are.
     """
     folders = tmp_path_factory.mktemp("sound"), tmp_path_factory.mktemp("meshes")
-    return make_dataset(*folders, overrides=CERTIFIED)
+    return make_dataset(*folders, overrides=REPEATED)
 
 
 @pytest.fixture

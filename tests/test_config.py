@@ -308,8 +308,9 @@ def test_configuration_is_inert() -> None:
 @pytest.mark.parametrize("key", sorted(EVERYTHING))
 def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: str) -> None:
     """A shard is reused when the hash agrees: a key too few mixes data, one too many wastes it."""
-    # How robust a grasp is is asked only with repeats, and how far it moved if that ends lifts.
-    base = load_config(overrides=[] if key == "certify.repeats" else ["certify.repeats=1"])
+    # Which samples are repeated is asked only with repeats, and how far a grasp moved if that ends
+    # lifts.
+    base = load_config(overrides=[] if key == "robustness.repeats" else ["robustness.repeats=1"])
     if key.startswith("lift.stop_"):
         base = override_config(base, ["lift.stop_when=lost_sample"])
     if key == "split.train_classes":
@@ -331,7 +332,7 @@ def test_datasets_that_were_begun_with_the_defaults_go_on() -> None:
 @pytest.mark.parametrize(
     ("settings", "switch"),
     [
-        (["certify.palm_noise=0.01"], "certify.repeats=1"),
+        (["robustness.share=0.5"], "robustness.repeats=1"),
         (["lift.stop_slip=0.02", "lift.stop_turn_deg=20"], "lift.stop_when=lost_sample"),
     ],
 )

@@ -214,7 +214,6 @@ def _shared(
     max_grasps: int | None = None,
     samples: int | None = None,
     samples_per_object: int | None = None,
-    certify: int | None = None,
     seed: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -254,8 +253,6 @@ def _shared(
         --samples N: Stop when all objects together have N samples; a larger N continues the build.
         --samples-per-object N: Stop an object when it has N samples. [default: 20, with fast and
             without --samples, --max-grasps and --candidates]
-        --certify K: Repeat the lift of each sample K times with disturbances, and store how many
-            hold. [default: 0]
         --seed S: Seed of all random draws. [default: 0]
         --workers N: Number of processes on this machine. [default: one per core]
         --scheduler ADDRESS: Use the running Dask scheduler at this address.
@@ -295,15 +292,13 @@ SETTINGS = {
     "--max-grasps": "max_grasps",
     "--samples": "samples",
     "--samples-per-object": "samples_per_object",
-    "--certify": "certify.repeats",
     "--seed": "seed",
 }
 #: Names of options: of a build, and of the workers.
 BUILD = (
     *("--objects", "--per-class", "--objects-seed", "--out", "--config", "--set", "--candidates"),
     *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--link", "--preshape"),
-    *("--only", "--certify"),
-    *("--seed", "--units", "--manifest", "--quiet"),
+    *("--only", "--seed", "--units", "--manifest", "--quiet"),
 )
 _TLS_FILES = ("--tls-ca-file", "--tls-cert", "--tls-key")
 TLS = ("--tls/--no-tls", *_TLS_FILES)

@@ -18,7 +18,6 @@ from drakegrasp.cli.console import say
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
-from drakegrasp.dataset.quality import holding_lines, holding_of
 from drakegrasp.dataset.statistics import (
     NO_NAME,
     Funnel,
@@ -33,7 +32,6 @@ from drakegrasp.dataset.statistics import (
     preshapes_of,
     split_shortfall,
 )
-from drakegrasp.dataset.trials import Trials
 from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
@@ -388,9 +386,6 @@ def print_stats(out: Path) -> None:
             say(line)
         for line in barren_lines(funnel, config):
             say(line)
-        if (holding := holding_of(Trials(out))) is not None:
-            for line in holding_lines(holding):
-                say(line)
         of_benchmark = (out / BUILTIN_FOLDER / BENCHMARK_FILE).is_file()
         for line in [] if of_benchmark else split_shortfall(splits, rule, config.split):
             say(line)

@@ -142,7 +142,7 @@ def assemble_locked(
             manifest = replace(manifest, rejected=find_keys(rejected, known, out))
         decisions = decide(manifest, shards)
         manifest = decisions.manifest
-        certified = manifest.config.certified
+        repeats = manifest.config.robustness.repeats > 0
 
         # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
@@ -153,7 +153,7 @@ def assemble_locked(
             for camera, file in files.items():
                 file.attrs.update(file_attributes(manifest, shards.seals, camera))
                 counts = {split: len(ids) for split, ids in decisions.ids.items()}
-                fields = stored_fields(DATA_FIELDS if camera else TRIAL_FIELDS, certified=certified)
+                fields = stored_fields(DATA_FIELDS if camera else TRIAL_FIELDS, repeats=repeats)
                 for name, count in (counts if camera else {"trials": shards.count}).items():
                     group = file.create_group(name)
                     for f in fields:
@@ -162,7 +162,7 @@ def assemble_locked(
             _write_table(files[""], "successes", SUCCESS_FIELDS, decisions.columns())
 
             # Rows are packed in any order, and each chunk is written at its own position.
-            tasks = list(pack_tasks(out, decisions, certified=certified))
+            tasks = list(pack_tasks(out, decisions, repeats=repeats))
             texts = sample_texts(manifest)
             surveyed = len({piece.object for piece in shards.slices})
             for done, task in enumerate(_packed(execute, tasks), start=1):

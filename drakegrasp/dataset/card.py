@@ -23,7 +23,6 @@ from drakegrasp.dataset.hdf5 import AnyArray, read_names
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, SCENES_FILE, TRIALS_FILE
-from drakegrasp.dataset.quality import holding_lines, holding_of
 from drakegrasp.dataset.scenes import SceneDataset, count_scenes, refuse_other_state
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.statistics import (
@@ -138,15 +137,13 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     """
     # While a build that adds objects runs, the manifest has more objects than the files.
     attempts, config = Trials(trials, any_name=True), manifest.config
-    funnel, holding, hand = funnel_of(attempts), holding_of(attempts), _known_hand(config)
+    funnel, hand = funnel_of(attempts), _known_hand(config)
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
     with open_samples(data) as file:
         rule = str(file.attrs.get("split_by", "class"))
         counts = _counts(file, funnel, distinct_samples(attempts))
         # Optional entries of the card, which most datasets lack.
         more = {"fingertip_loads": _loads(file, hand and rated_load(hand[0]))}
-    if holding is not None:
-        more["p_hold"] = {"in_words": holding_lines(holding), **asdict(holding)}
 
     # The known limits, and one limit that follows from the counts.
     limits = [*LIMITS]
@@ -439,17 +436,6 @@ samples come from {cells:,} cells, of 42 directions each."""
     return "\n\n".join([head, *parts])
 
 
-def _bears(content: Mapping[str, Any]) -> str:
-    lines = "\n".join(f"* {line}." for line in content["p_hold"]["in_words"])
-    return f"""## How much disturbance a grasp tolerates
-
-A share of the lifts is repeated with noise on the palm's pose, friction and mass (`p_hold_samples`
-of `p_hold_repeats`, law in the setting `certify`). Intervals are of 95 %; a grasp counts for the
-inverse of its probability to be drawn.
-
-{lines}"""
-
-
 def _scenes(content: Mapping[str, Any]) -> str:
     rows = [(split, *counts.values()) for split, counts in content["scenes"].items()]
     heads = ("split", *next(iter(content["scenes"].values())))
@@ -514,7 +500,6 @@ SECTIONS: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
     ("licences", _licences),
     ("counts", _how_many),
     ("fingertip_loads", _pressed),
-    ("p_hold", _bears),
     ("scenes", _scenes),
     ("limits", _limits),
     ("columns", _cameras),

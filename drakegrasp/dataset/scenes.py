@@ -75,7 +75,7 @@ class SceneDataset:
     | `visible` | (g, k) bool | whether the camera sees the contact after closing |
     | `held`, `sample`, `precision`, `stable`, `tested` | (g,) bool | labels, see the schema |
     | `outcome` | (g,) uint8 | see `Outcome` |
-    | `p_hold_samples`, `p_hold_repeats` | (g,) int32 | k of n disturbed repeats, or 0 |
+    | `robust_kept`, `robust_tried` | (g,) int32 | k of n disturbed repeats, or 0 |
     | `trial_id` | (g,) int64 | row of trials.hdf5 |
     | `X_TC` | (4, 4) float32 | pose of the camera; X_TA is this, or 1 |
     | `X_AO` | (4, 4) float32 | pose of the object |
@@ -502,7 +502,7 @@ class Rounds:
 #: Fields of /grasps that items contain unchanged.
 _AS_STORED = (
     *("q_open", "q", "q_held", "held", "sample", "precision", "stable", "tested", "outcome"),
-    *("p_hold_samples", "p_hold_repeats", "trial_id"),
+    *("robust_kept", "robust_tried", "trial_id"),
 )
 
 

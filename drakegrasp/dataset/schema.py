@@ -31,7 +31,7 @@ SHOWN_UNITS = {"": 1.0, "s": 1.0, "N": 1.0, "kg": 1.0, "mm": 1e3, "°": float(np
 CAMERAS = ("oto", "otm")
 #: Limits of fields: positive numbers, non-negative numbers, angles, fractions.
 POSITIVE = 5e-324
-ABOVE_0, FROM_0, ANGLE, SHARE = (POSITIVE, np.inf), (0.0, np.inf), (0.0, np.pi), (0.0, 1.0)
+ABOVE_0, FROM_0, ANGLE = (POSITIVE, np.inf), (0.0, np.inf), (0.0, np.pi)
 
 #: The conventions in words, stored as attributes in every file.
 CONVENTIONS = {
@@ -215,10 +215,10 @@ def sources_of(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(chain.from_iterable(needs.get(name, (name,)) for name in names)))
 
 
-def stored_fields(fields: Sequence[Field], *, certified: bool) -> tuple[Field, ...]:
-    """Return the fields that files have; HOLD_FIELDS are only in those of builds that certify."""
-    own = {field.name for field in HOLD_FIELDS}
-    return tuple(f for f in fields if certified or f.name.rpartition("/")[2] not in own)
+def stored_fields(fields: Sequence[Field], *, repeats: bool) -> tuple[Field, ...]:
+    """Return the fields that files have; ROBUST_FIELDS are only in those of builds with repeats."""
+    own = {field.name for field in ROBUST_FIELDS}
+    return tuple(f for f in fields if repeats or f.name.rpartition("/")[2] not in own)
 
 
 def _since(stage: Stage, *fields: Field) -> tuple[Field, ...]:
@@ -413,24 +413,17 @@ CONDITION_FIELDS: tuple[Field, ...] = (
           of="conditions.sensor.seed"),
 )
 
-#: How much disturbance a lifted attempt tolerates; see `drakegrasp.simulation.robustness`. Missing
-#: in files of builds that do not certify, see `stored_fields`.
-HOLD_FIELDS: tuple[Field, ...] = tuple(
+#: How often a sample survives noise; see `drakegrasp.simulation.robustness`. Missing in files of
+#: builds without repeats, see `stored_fields`.
+ROBUST_FIELDS: tuple[Field, ...] = tuple(
     replace(field, stage=Stage.LIFTED, some=True, optional=True)
     for field in (
-        Field("p_hold_samples", "", "int32", "-", "-",
-              "k: number of disturbed repeats (section `certify`) that would be samples by the "
-              "default filters, except those of images and outliers"),
-        Field("p_hold_held", "", "int32", "-", "-", "number of disturbed repeats that hold"),
-        Field("p_hold_repeats", "", "int32", "-", "-",
-              "n: number of disturbed repeats with a verdict; 0 for an attempt that was not "
-              "selected"),
-        Field("p_hold_half_step", "", "float64", "-", "-",
-              "whether the undisturbed attempt would be a sample at half the time step: 1 or 0; "
-              "NaN if this was not tried or has no verdict"),
-        Field("p_hold_probability", "", "float64", "-", "-",
-              "probability with which an attempt of this kind was selected for repeats; NaN if the "
-              "attempt was not selected", limits=(POSITIVE, 1.0)),
+        Field("robust_tried", "", "int32", "-", "-",
+              "number of disturbed repeats (section `robustness`) with a verdict; 0 for an attempt "
+              "that was not selected"),
+        Field("robust_kept", "", "int32", "-", "-",
+              "number of these that would be samples by the default filters, except those of "
+              "images and outliers"),
     )
 )
 
@@ -468,7 +461,7 @@ DATA_FIELDS: tuple[Field, ...] = (
           "areas of the contact patches after closing", of="closed_area"),
     Field("grasp_props/area_held", "k", "float32", "m^2", "-",
           "areas of the contact patches after the lift", of="lifted_area"),
-    *_copied("grasp_props", *HOLD_FIELDS),
+    *_copied("grasp_props", *ROBUST_FIELDS),
     # The mass is in object_props.
     *_copied("conditions", *(field for field in CONDITION_FIELDS if field.name != "mass")),
     Field("object_props/object_name", "", "str", "-", "-", "name of the object"),
@@ -547,17 +540,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         _SLIP_USE,
         *_measured("trial", *_WORDS),
     ),
-    *HOLD_FIELDS,
-)
-
-#: How robust a success is; see `drakegrasp.simulation.robustness`.
-CERTIFICATE_FIELDS: tuple[Field, ...] = (
-    Field("certified_share", "", "float64", "-", "-",
-          "fraction of the `certify.repeats` disturbed repeats that hold; NaN if not certified",
-          limits=SHARE),
-    Field("certified_friction", "", "float64", "-", "-",
-          "smallest friction between hand and object at which the grasp holds; inf if it does not "
-          "hold at the configured friction; NaN if not certified", limits=FROM_0),
+    *ROBUST_FIELDS,
 )
 
 
@@ -578,7 +561,6 @@ LOOK_FIELDS: tuple[Field, ...] = (
     *(field for camera in CAMERAS for field in _image_fields(camera)),
     Field("X_CI_otm", "12", "float64", "m, -", "C (otm)",
           "image frame estimated from the otm mask"),
-    *CERTIFICATE_FIELDS,
 )
 
 #: A row per success, in `/successes` of trials.hdf5.
@@ -586,7 +568,6 @@ SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "row of /trials"),
     Field("removal", "", "uint8", "-", "-",
           f"why the success is not a sample: {_labels(list(Removal))}"),
-    *CERTIFICATE_FIELDS,
 )
 
 #: A row per object, in `/objects` of trials.hdf5.
@@ -797,7 +778,7 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     *_WORDS,
     Field("sample", "", "bool", "-", "-", "whether the grasp is a sample of the dataset"),
     Field("source", "", "uint8", "-", "-", "sampler of the palm pose, see /trials", of="source"),
-    *(replace(field, of=field.name) for field in HOLD_FIELDS),
+    *(replace(field, of=field.name) for field in ROBUST_FIELDS),
     *_PRESHAPE,
     Field("X_TG", "12", "float32", "m, -", "T", "pose of the palm at the start and while closing"),
     Field("X_TG_held", "12", "float32", "m, -", "T",

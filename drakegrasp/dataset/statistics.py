@@ -24,7 +24,6 @@ from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.opening import open_samples, open_trials
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.quality import holding_of
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import NONE, Trials, shard_part
 from drakegrasp.distinct import (
@@ -411,15 +410,13 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     ]
     splits = [] if unfinished else [asdict(split) for split in count_splits(out)]
     units = {"done": unfinished.done, "total": unfinished.total} if unfinished else None
-    counts: dict[str, Any] = {
+    return {
+        "path": str(out),
+        "unfinished": units,
         "objects": objects,
         "preshapes": list(map(asdict, preshapes)),
         "splits": splits,
     }
-    holding = None if unfinished else holding_of(Trials(out))
-    if holding is not None:
-        counts["p_hold"] = asdict(holding)
-    return {"path": str(out), "unfinished": units, **counts}
 
 
 #: If a split's fraction of the samples is off by more than this factor, it is reported.

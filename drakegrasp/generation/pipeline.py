@@ -20,7 +20,6 @@ import numpy as np
 
 from drakegrasp.config import MOST_PALMS, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
-from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import (
     headers_by_object,
     judge_successes,
@@ -89,8 +88,6 @@ from drakegrasp.simulation.drive import drive_of
 
 #: Number of samples of each object that a build makes if nothing else ends it.
 SAMPLES_PER_OBJECT = 20
-#: Margin of ranks at the border of a split, which depends on which objects have samples.
-NEAR_BORDER = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -620,13 +617,11 @@ class _Build:
         add: _Add,
     ) -> None:
         """Run work units, and count their results."""
-        tested = _likely_tested(manifest)
         units = (
             WorkUnit(
                 out=self._out,
                 header=header,
                 config=manifest.config,
-                likely_tested=header.object_name in tested,
                 restartable=self._pool is not None,
             )
             for header in headers
@@ -713,21 +708,6 @@ def _known_entry(
 
 def _same_mesh(entry: ObjectEntry, other: ObjectEntry | RefusedMesh) -> bool:
     return entry.mesh_sha256 == other.mesh_sha256
-
-
-def _likely_tested(manifest: Manifest) -> set[str]:
-    """Return the names of the objects that a split by object may use for test or validation.
-
-    The split depends on which objects have samples. The fractions are slightly larger here, so that
-    hardly any object is missed.
-    """
-    rules = manifest.config.split
-    ranks = {
-        entry.name: rank_in_split(group, rules.seed)
-        for entry, group in zip(manifest.objects, manifest.groups, strict=True)
-    }
-    low, high = rules.test_fraction + NEAR_BORDER, 1.0 - rules.valid_fraction - NEAR_BORDER
-    return {name for name, rank in ranks.items() if rank < low or rank >= high}
 
 
 def _count(names: Sequence[str], what: str) -> str:

@@ -443,7 +443,10 @@ def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
     trials = {name: values[order] for name, values in task.trials.items()}
     scene = trials["resting"]
     columns = grasps_of_trials(trials, X_TO[scene], task.samples[order])
-    stored = {f.name for f in stored_fields(SCENE_GRASP_FIELDS, certified=task.config.certified)}
+    stored = {
+        f.name
+        for f in stored_fields(SCENE_GRASP_FIELDS, repeats=task.config.robustness.repeats > 0)
+    }
     return {name: values for name, values in columns.items() if name in stored} | {
         "scene": scene.astype(np.int64),
         "object": np.zeros(len(scene), dtype=np.int64),

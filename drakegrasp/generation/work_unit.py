@@ -21,13 +21,11 @@ from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import (
     SurveyTask,
     find_hits,
-    judge_successes,
-    successes_of,
     survey_tasks,
 )
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import object_files, places, shards_folder
-from drakegrasp.dataset.schema import HOLD_FIELDS, LOOK_FIELDS
+from drakegrasp.dataset.schema import LOOK_FIELDS, ROBUST_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
@@ -55,7 +53,7 @@ from drakegrasp.runtime.journal import (
     open_journal,
 )
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.robustness import certify, is_drawn
+from drakegrasp.simulation.robustness import is_drawn, repeat_disturbed
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.table import AnyArray, Table
@@ -65,11 +63,9 @@ from drakegrasp.table import AnyArray, Table
 HANG_FACTOR = 1.5
 #: Computing time after which any other step of a unit is considered to hang [s].
 STAGE_SECONDS = 600.0
-#: A certificate hangs if it takes this many times the limit of all its simulations.
-CERTIFY_FACTOR = 2.0
-#: Filters for the samples that are certified: all default filters except that of outliers, which
-#: needs all grasps of an object.
-CERTIFY_FILTERS = FilterConfig(outlier_sigma=0.0)
+#: Filters for the samples that are repeated: all default filters except those of images, which
+#: repeats do not have, and of outliers, which need all grasps of an object.
+REPEAT_FILTERS = FilterConfig(outlier_sigma=0.0)
 #: Descriptions of the steps that are not attempts, for error messages.
 _STEPS = {
     "build": "building its scene",
@@ -88,8 +84,6 @@ class WorkUnit:
         out: Directory of the dataset, as a path of the process that runs the task.
         header: Object and range of candidates.
         config: Configuration of the dataset.
-        likely_tested: Whether samples may be used for test or validation, see
-            `certify.share_tested`.
         restartable: Whether the process that runs the unit is restarted when it dies. If so, a
             crash or a hang ends only the attempt; if not, it propagates to the caller.
     """
@@ -97,7 +91,6 @@ class WorkUnit:
     out: Path
     header: ShardHeader
     config: Config
-    likely_tested: bool = False
     restartable: bool = False
 
     def reads(self) -> dict[str, Path]:
@@ -122,7 +115,7 @@ class UnitSummary:
     Attributes:
         header: Header of the unit.
         outcomes: Number of attempts by outcome.
-        seconds: Wall-clock time by stage (`build`, `try`, `measure`, `look`, `certify` if there are
+        seconds: Wall-clock time by stage (`build`, `try`, `measure`, `look`, `repeat` if there are
             repeats, `write`) [s]; for logs only. Empty if the shard existed already.
         errors: Number of solver errors by message.
         hits: Candidates and stand-offs of the attempts that count for the target, see `find_hits`;
@@ -142,7 +135,7 @@ _one_unit = threading.Lock()
 
 @one_thread
 def run_unit(unit: WorkUnit) -> UnitSummary:
-    """Run all attempts of a unit, render its successes, certify lifts, and write its shard.
+    """Run all attempts of a unit, render its successes, repeat samples, and write its shard.
 
     A unit whose shard is complete is not run again.
 
@@ -200,9 +193,9 @@ class _Experiment:
         with self._stage("measure"):
             trials = trial_rows(self._setup, self._attempts, records)
         looks = self._looks(records)
-        if self._config.certified:
-            with timed(self._seconds, "certify"):
-                trials |= self._certify(trials, looks)
+        if self._config.robustness.repeats:
+            with timed(self._seconds, "repeat"):
+                trials |= self._repeats(records)
 
         with self._stage("write"):
             shard = Shard(header=header, trials=trials, looks={**looks})
@@ -291,59 +284,33 @@ class _Experiment:
                     looks[name][k] = value
         return Table(looks)
 
-    def _samples(self, trials: dict[str, AnyArray], looks: Table) -> list[int]:
-        """Return the rows of the attempts that are samples by the default filters."""
-        rows = np.flatnonzero(trials["outcome"] == Outcome.SUCCESS)
-        found = Table({name: values[rows] for name, values in trials.items()})
-        found = found.with_columns(looks, depth_otm=looks["image_otm"][:, 3])
-        removal = judge_successes(successes_of(found, self._config.camera), CERTIFY_FILTERS)
-        return rows[removal == Removal.KEPT].tolist()
-
-    def _certify(self, trials: dict[str, AnyArray], looks: Table) -> dict[str, AnyArray]:
-        """Certify the lifts that are drawn for it, and return the columns of results.
-
-        The least friction of a success is written to its row of `/looks`.
-        """
-        rules, known = self._config.certify, set(self._samples(trials, looks))
-        tested = rules.share_tested if self._unit.likely_tested else 0.0
-        of_samples = max(rules.share, tested)
-        holds = {field.name: field.empty(len(self._attempts), {}) for field in HOLD_FIELDS}
-        look_of = {row: k for k, row in enumerate(looks["row"].tolist())}
-        for row in np.flatnonzero(np.isfinite(trials["time_lift"])).tolist():
-            probability = of_samples if row in known else rules.share_others
-            if not is_drawn(self._attempts[row], probability):
-                continue
-            held = row in look_of
-            found = self._certificate(row, held=held)
-            holds["p_hold_probability"][row] = probability
-            for name in found.keys() & holds.keys():
-                holds[name][row] = found[name]
-            if held and found:
-                looks["certified_friction"][look_of[row]] = found["certified_friction"]
+    def _repeats(self, records: Sequence[TrialRecord]) -> dict[str, AnyArray]:
+        """Repeat the samples that are drawn for it; return the columns of ROBUST_FIELDS."""
+        columns = {f.name: f.empty(len(records), {}) for f in ROBUST_FIELDS}
+        for row, record in enumerate(records):
+            drawn = is_drawn(self._attempts[row], self._config.robustness.share)
+            if drawn and self._is_sample(record):
+                repeats = self._repeat(row)
+                columns["robust_tried"][row] = len(repeats)
+                columns["robust_kept"][row] = sum(map(self._is_sample, repeats))
         # A scene in which Drake failed is no longer cached, so build it again.
         self._setup.renew_scene()
-        return holds
+        return columns
 
-    def _certificate(self, row: int, *, held: bool) -> dict[str, float]:
-        """Return the results of `certify` for an attempt; empty if a process died in this step."""
-        step, config, prepared = f"certify {row}", self._config, self._setup.prepared
+    def _repeat(self, row: int) -> list[TrialRecord]:
+        """Return the disturbed repeats of an attempt; none if a process died in this step."""
+        step, config, prepared = f"repeat {row}", self._config, self._setup.prepared
         attempt = self._attempts[row]
         if self._journal.verdict(step) is not None:
-            return {}
-        simulations = config.certify.repeats + config.certify.friction_steps + 1
-        with self._journal.step(step, CERTIFY_FACTOR * simulations * config.attempt_seconds):
-            return certify(
-                prepared.model,
-                prepared.resting_poses[attempt.resting],
-                attempt,
-                config,
-                self._is_sample,
-                held=held,
-            )
+            return []
+        limit = HANG_FACTOR * config.robustness.repeats * config.attempt_seconds
+        with self._journal.step(step, limit):
+            X_TO = prepared.resting_poses[attempt.resting]
+            return repeat_disturbed(prepared.model, X_TO, attempt, config)
 
     def _is_sample(self, trial: TrialRecord) -> bool:
-        """Return whether the trial of a repeat is a sample by the default filters."""
-        rules = self._config.model_copy(update={"filters": CERTIFY_FILTERS})
+        """Return whether a trial is a sample by the default filters."""
+        rules = self._config.model_copy(update={"filters": REPEAT_FILTERS})
         return judge_sample(self._setup.prepared.model, trial, rules, views=False) is Removal.KEPT
 
 

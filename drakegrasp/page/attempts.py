@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.assembly.survey import own_setting
-from drakegrasp.dataset.quality import PARTS, share_text, suspicion
+from drakegrasp.dataset.quality import PARTS, suspicion
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.trials import NONE
@@ -26,7 +26,6 @@ from drakegrasp.page.looks import (
     attempt_scene,
     contact_dots,
     look_source,
-    read_certificate,
     read_look,
     read_rows,
 )
@@ -37,7 +36,6 @@ from drakegrasp.table import AnyArray
 QUANTITIES = {
     "suspicion": Shown("suspicion", digits=2),
     "force": Shown("largest force", "N"),
-    "p_hold": Shown("p_hold: share of disturbed repeats that would be samples", digits=2),
     **{part.name: part.shown for part in PARTS},
 }
 #: Texts of two choices of the split: all samples, and all attempts that are not samples.
@@ -72,7 +70,7 @@ class Attempts(Gallery):
         "decision": "decision",
     }
     QUANTITIES = QUANTITIES
-    RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle", "p_hold")
+    RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle")
     SORTS: ClassVar = {
         **{name: quantity.title for name, quantity in QUANTITIES.items()},
         "row": "row of the dataset",
@@ -302,37 +300,7 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
             if field.shown is not None and field.name not in in_parts
         ),
         ("other links after closing", str(int(row["closed_other_links"])) if closed else "–"),
-        *_bears(row),
-        *_certificate(snapshot, i),
     ]
-
-
-def _bears(row: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return how much disturbance an attempt tolerates; empty if it was not repeated."""
-    probability, half = row["p_hold_probability"], row["p_hold_half_step"]
-    if np.isnan(probability):
-        return []
-    repeats = int(row["p_hold_repeats"])
-    lines = [
-        (f"disturbed repeats that {what}", share_text(int(row[f"p_hold_{name}"]), repeats))
-        for name, what in (("samples", "would be samples"), ("held", "hold"))
-    ]
-    step = {0.0: "no", 1.0: "yes"}.get(float(half), "not known")
-    return [*lines, ("would be a sample at half the time step", step)]
-
-
-def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
-    """Return how robust a success is; empty if this was not measured."""
-    if not snapshot.table.held[i]:
-        return []
-    found, lines = read_certificate(snapshot, i), []
-    share, friction = found["certified_share"], found["certified_friction"]
-    if np.isfinite(share):
-        lines.append(("repeats with noise that hold", f"{100.0 * share:.0f} %"))
-    if not np.isnan(friction):
-        least = f"{friction:.3g}" if np.isfinite(friction) else "more than it has"
-        lines.append(("least friction with the hand that holds", least))
-    return lines
 
 
 def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:

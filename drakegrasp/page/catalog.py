@@ -41,12 +41,12 @@ from drakegrasp.table import AnyArray, Table, join
 
 Found = TypeVar("Found")
 #: Quantities for filtering and sorting, besides the parts of the suspicion.
-EXTRA = ("suspicion", "force", "p_hold")
+EXTRA = ("suspicion", "force")
 FEATURES = (*EXTRA, *(part.name for part in PARTS))
 #: Columns that identify an attempt.
 IDENTITY = ("object", "candidate", "standoff_index")
-#: Further columns from which features are computed.
-_READ = ("closed_f_Q_O", "p_hold_samples", "p_hold_repeats")
+#: Further column from which features are computed.
+_READ = "closed_f_Q_O"
 #: Columns that the table of attempts copies, and their types.
 _KEPT: dict[str, type[np.generic]] = {
     "object": np.int32,
@@ -72,7 +72,7 @@ def read_attempts(trials: Trials) -> Kept:
     Raises:
         DataError: If a file cannot be read.
     """
-    names = dict.fromkeys((*_KEPT, *COLUMNS, *_READ))
+    names = dict.fromkeys((*_KEPT, *COLUMNS, _READ))
     blocks = [_columns_of(block) for block in trials.blocks(list(names))]
     tables, few = zip(*blocks, strict=True)
     starts = np.cumsum([0, *(table.count for table in tables)]).tolist()
@@ -93,11 +93,9 @@ def _columns_of(columns: Mapping[str, AnyArray]) -> Kept:
     # The largest force of a fingertip, after the lift if there was one.
     lifted = np.isfinite(few["time_lift"])[:, None, None]
     forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
-    repeats = few["p_hold_repeats"]
     extra = {
         "suspicion": doubts.score,
         "force": norm(forces).max(axis=1, initial=-np.inf),
-        "p_hold": np.where(repeats > 0, few["p_hold_samples"] / np.maximum(repeats, 1), np.nan),
     }
 
     # A value that a contact without a normal lacks counts as the largest part, so it is infinite.

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, shards_folder
-from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.paths import DATA_FILES, shards_folder
+from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
@@ -208,23 +208,6 @@ def dots_of(
             (u, v), (tip_u, tip_v) = project(K, np.array([point, tip])).tolist()
             dots.append(Dot(finger, u, v, tip_u, tip_v, is_hidden(finger, u, v)))
     return dots
-
-
-def read_certificate(snapshot: Snapshot, i: int) -> dict[str, float]:
-    """Return the certificate of a success, by the names of CERTIFICATE_FIELDS; NaN if it has none.
-
-    Raises:
-        DataError: If a file was replaced in the meantime.
-    """
-    try:
-        with open_hdf5(snapshot.out / TRIALS_FILE) as file:
-            successes = file["successes"]
-            (found,) = np.nonzero(successes["trial_id"][:] == i)
-            certificate = {f.name: float(successes[f.name][found[0]]) for f in CERTIFICATE_FIELDS}
-    except (OSError, KeyError, ValueError, IndexError):
-        certificate = {f.name: float("nan") for f in CERTIFICATE_FIELDS}
-    snapshot.refuse_replaced()
-    return certificate
 
 
 class HandView:

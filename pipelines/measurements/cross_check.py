@@ -24,11 +24,11 @@ from typing import Any, Literal, TypeVar, get_args
 
 import click
 import numpy as np
+from scipy.stats import binomtest
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
-from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
@@ -164,7 +164,7 @@ def _share(hits: int, count: int) -> dict[str, float] | None:
     """Return a fraction with its interval, or None if `count` is 0."""
     if not count:
         return None
-    low, high = wilson_interval(hits, count)
+    low, high = binomtest(hits, count).proportion_ci(method="wilson")
     return {"share": hits / count, "low": low, "high": high}
 
 

@@ -26,10 +26,10 @@ import mujoco_baseline
 import mujoco_scene
 from cross_check import Group, StoredLift, draw_lifts
 from mujoco_baseline import MujocoBaseline
+from scipy.stats import binomtest
 
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
-from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.mjcf import links
 from drakegrasp.mjcf.decomposition import convex_parts
 from drakegrasp.outcomes import Outcome
@@ -120,7 +120,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
         yield f"\n{len(own)} of {group}\n\n| setting | hold | other verdicts |\n|---|--:|--:|"
         for setting in SETTINGS:
             hits = sum(row[setting] == held for row in own)
-            low, high = wilson_interval(hits, len(own))
+            low, high = binomtest(hits, len(own)).proportion_ci(method="wilson")
             others = sum((row[setting] == held) != (row["usual"] == held) for row in own)
             yield f"| {setting} | {hits / len(own):.0%} ({low:.0%} to {high:.0%}) | {others} |"
 

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
+from scipy.stats import binomtest
 
-from drakegrasp.dataset.quality import wilson_interval
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.files import read_dictionary
 
@@ -51,7 +51,7 @@ def read_own_verdicts(folder: Path) -> dict[str, bool]:
 def compare(own: dict[str, bool], lines: list[dict[str, Any]]) -> str:
     """Return the table row of a protocol: held, interval, agreement."""
     held = sum(line["success"] for line in lines)
-    low, high = wilson_interval(held, len(lines))
+    low, high = binomtest(held, len(lines)).proportion_ci(method="wilson")
     row = f"{lines[0]['protocol']} | {lines[0]['simulator']} {lines[0]['versions']['mujoco']} | "
     row += f"{held} of {len(lines)} | {held / len(lines):.1%} | {low:.0%} to {high:.0%}"
     pairs = []
@@ -69,7 +69,7 @@ def table(folder: Path, results: list[Path]) -> str:
     """Return the table of all protocols."""
     own = read_own_verdicts(folder)
     held = sum(own.values())
-    low, high = wilson_interval(held, len(own))
+    low, high = binomtest(held, len(own)).proportion_ci(method="wilson")
     rows = [
         "| protocol | simulator | held | share | 95 % interval | as its own code |",
         "|---|---|---|---|---|---|",

@@ -15,9 +15,7 @@ The script prints JSON for each change: the number of lifts with a verdict; the 
 held and that are samples, with their intervals; the outcomes that differ from those as stored; and
 CPU seconds. Samples are judged by the filters except those that need pictures, the outlier filter
 and user-defined filters. For lifts it also prints the medians of slip, turn, force and of how far a
-closing joint opened. With `--disturbed` it also reports how well numbers of the stored lift predict
-the samples for which at least half of the lifts `palm` and `together` are samples (area under the
-ROC curve).
+closing joint opened.
 """
 
 from __future__ import annotations
@@ -35,18 +33,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import binomtest
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
-from drakegrasp.dataset.quality import (
-    MUCH,
-    PREDICTED_BY,
-    area_under_roc,
-    predictors,
-    wilson_interval,
-)
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import make_pose, rotation_about
@@ -212,21 +204,13 @@ def _of_change(pairs: Sequence[tuple[Found, Found]]) -> Found:
 
 def _share(hits: Sequence[bool]) -> list[float]:
     """Return the count, the fraction, and its interval."""
-    low, high = wilson_interval(sum(hits), len(hits)) if hits else (np.nan, np.nan)
+    low, high = np.nan, np.nan
+    if hits:
+        low, high = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
     return [
         sum(hits),
         *(round(float(x), 3) for x in (np.mean(hits) if hits else np.nan, low, high)),
     ]
-
-
-def ranking(out: Path, ids: npt.NDArray[np.int64], rows: Sequence[Sequence[Found]]) -> Found:
-    """Return how well numbers of stored lifts predict which samples survive half of the noise."""
-    noisy = [[x["sample"] for x in row if x["change"] in ("palm", "together")] for row in rows]
-    much = np.array([np.mean(own) >= MUCH for own in noisy])
-    told = predictors(Trials(out)[ids].columns(PREDICTED_BY))
-    areas = {name: area_under_roc(values, much) for name, values in told.items()}
-    ranked = sorted(areas.items(), key=lambda pair: -pair[1])
-    return {"bear half or more": int(much.sum()), "AUC": {k: round(v, 2) for k, v in ranked}}
 
 
 @one_thread
@@ -256,8 +240,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows.append(try_again(out, trial_id, config, other, prepared))
             report(len(rows), len(ids))
     result: Found = {"settings": arguments.settings, "rows": arguments.rows, **summary(rows)}
-    if other is None and rows:
-        result |= ranking(out, ids, rows)
     sys.stdout.write(json.dumps(result, indent=1) + "\n")
     return 0
 

@@ -21,7 +21,7 @@ import yaml
 from click.testing import CliRunner, Result
 from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
 from helpers.bad_inputs.kinds import Kind, Workplace
-from helpers.datasets import CERTIFIED, OTM, OTO, TRIALS, make_dataset
+from helpers.datasets import OTM, OTO, REPEATED, TRIALS, make_dataset
 from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
@@ -64,7 +64,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sound dataset with meshes, a hand file, decisions and predictions."""
     base = tmp_path_factory.mktemp("sound")
     (base / "meshes").mkdir()
-    out = make_dataset(base / "out", base / "meshes", overrides=CERTIFIED)
+    out = make_dataset(base / "out", base / "meshes", overrides=REPEATED)
     manifest = json.loads((out / MANIFEST).read_text())
     del manifest["sha256"]  # other rules find what is wrong
     key = {"object": "1_box_a", "candidate": 0, "standoff_index": 0}
@@ -428,7 +428,6 @@ NAMES_OF_OPTIONS = (
     "max_grasps",
     "hand",
     "config",
-    "certify",
     "builtin.",
     "seed: ",
 )

@@ -54,11 +54,10 @@ SAMPLE = [
     "scenes.when=assembled",
     "scenes.views=1",
 ]
-#: Every kind of step of a unit: also certificates.
+#: Every kind of step of a unit: also repeats.
 EVERY_STEP = [
     *SAMPLE,
-    "certify.repeats=1",
-    "certify.share=1",
+    "robustness.repeats=1",
 ]
 
 

@@ -63,12 +63,6 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "early word": ("stable", MISSING, lambda _: True, "stable must be 0 before the stage lifted"),
     "lifted pose": ("X_TO_lifted", SUCCESS, mirrored, "X_TO_lifted must have an orthonormal"),
     "early clearance": ("clearance_lift", HAND, lambda _: 0.1, "clearance_lift must be NaN before"),
-    "probability": (
-        "p_hold_probability",
-        SUCCESS,
-        lambda _: 1.5,
-        "p_hold_probability must be above 0..1",
-    ),
     "friction in use": ("slip_use", SLIPPED, lambda u: u + 1e-6, "slip_use must follow from"),
 }
 
@@ -105,12 +99,7 @@ def test_a_wrong_value_of_a_trial_is_found(out: Path, cases: dict[int, str]) -> 
 
 def test_a_removal_without_a_meaning_is_found(out: Path) -> None:
     change(out, TRIALS, "successes/removal", 2, lambda _: 14)  # was one, and is none
-    change(out, TRIALS, "successes/certified_share", 1, lambda _: 1.5)
-    must_find(
-        out / TRIALS,
-        (TRIALS, "/successes", 2, "removal must be one of 0, 1, 2"),
-        (TRIALS, "/successes", 1, "certified_share must be 0..1"),
-    )
+    must_find(out / TRIALS, (TRIALS, "/successes", 2, "removal must be one of 0, 1, 2"))
 
 
 PROPS, GRASP = "object_props/", "grasp_props/"
@@ -199,9 +188,8 @@ def slightly_wrong(values: AnyArray) -> AnyArray:
 def test_a_last_place_of_a_sample_that_its_trial_does_not_have_is_found(out: Path) -> None:
     copied = [f.name for f in DATA_FIELDS if f.of and f.name not in IMAGES]
     assert len(copied) > 20
-    # The first decides what is due, the second is on its limit.
-    others = (GRASP + "unused", GRASP + "p_hold_probability")
-    places = [name for name in copied if name not in others]
+    # This column decides what is due.
+    places = [name for name in copied if name != GRASP + "unused"]
     for place in places:
         change(out, OTM, f"train/{place}", 1, slightly_wrong)
     must_find(out, *((OTM, "/train", 1, f"{name} must follow from its trial") for name in places))

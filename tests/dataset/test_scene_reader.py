@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import CERTIFIED, make_dataset
+from helpers.datasets import REPEATED, make_dataset
 
 from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.errors import DataError
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.sim
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out, meshes = tmp_path_factory.mktemp("scenes") / "out", tmp_path_factory.mktemp("meshes")
-    make_dataset(out, meshes, overrides=[*CERTIFIED, "split.by=class"])
+    make_dataset(out, meshes, overrides=[*REPEATED, "split.by=class"])
     make_scenes(out)
     return out / "scenes.hdf5"
 

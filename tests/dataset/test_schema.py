@@ -21,7 +21,7 @@ from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
-    HOLD_FIELDS,
+    ROBUST_FIELDS,
     SCHEMA_VERSION,
     TRIAL_FIELDS,
     VERIFICATION_FIELDS,
@@ -115,7 +115,7 @@ def _leads_to_something(root: type, path: str) -> bool:
         *(
             (TrialRow, f)
             for f in TRIAL_FIELDS
-            if f not in HOLD_FIELDS and f.name not in ASSEMBLED_FIELDS and f.derive is None
+            if f not in ROBUST_FIELDS and f.name not in ASSEMBLED_FIELDS and f.derive is None
         ),
         *((Verification, f) for f in VERIFICATION_FIELDS),
     ],

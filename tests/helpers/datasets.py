@@ -182,10 +182,8 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         row |= {"surface_distance": np.zeros(3), "normal_angle": np.zeros(3), **hold(row)}
         raised = make_pose(np.eye(3), [0.0, 0.0, 0.25]) @ X_TG
         row["X_TO_lifted"] = pack_pose(raised @ invert_pose(unpack_pose(row["X_OG_lifted"])))
-    if stage >= Stage.LIFTED and config.certified:
-        k = 3 if outcome is Outcome.SUCCESS else 0
-        row |= {"p_hold_samples": k, "p_hold_held": k + number % 2, "p_hold_repeats": 4}
-        row |= {"p_hold_half_step": float(k > 0), "p_hold_probability": 1.0 if k else 0.5}
+    if outcome is Outcome.SUCCESS and config.robustness.repeats:
+        row |= {"robust_tried": config.robustness.repeats, "robust_kept": 3}
     # A quantity that has no story here is 1, from its stage on.
     told = {
         f.name: 1.0
@@ -250,7 +248,7 @@ _KEPT = TemporaryDirectory(prefix="datasets-")
 
 
 #: With these values all columns are there.
-CERTIFIED = ("certify.repeats=4", "certify.share_others=0.5")
+REPEATED = ("robustness.repeats=4",)
 
 
 def make_dataset(out: Path, meshes: Path, *, overrides: Iterable[str] = ()) -> Path:

@@ -31,7 +31,7 @@ from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.candidates import normal_candidates, palm_attempts, sample_candidates
 from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.palms import palm_motion
-from drakegrasp.simulation.robustness import _noise_factor
+from drakegrasp.simulation.robustness import PALM_SHIFT, PALM_TURN, _noise_factor
 from drakegrasp.simulation.samplers import rotation_candidates
 from drakegrasp.simulation.screen import predict
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
@@ -141,14 +141,10 @@ def main(meshes: Path | None) -> dict[str, object]:
             7,
         )
         found[f"split by {by}"] = digest(*split.values())
-    noise = load_config().certify
     stream = Stream(7, 1)
-    found["certificate noise"] = digest(
-        *(
-            palm_motion(stream.normal(6), noise.palm_noise, np.deg2rad(noise.palm_noise_deg))
-            for _ in range(100)
-        ),
-        np.array([_noise_factor(stream, 0.1) for _ in range(100)]),
+    found["noise of repeats"] = digest(
+        *(palm_motion(stream.normal(6), PALM_SHIFT, PALM_TURN) for _ in range(100)),
+        np.array([_noise_factor(stream) for _ in range(100)]),
     )
     clean = np.full((64, 64), 0.3, dtype=np.float32)
     sensor = DepthSensor(noise=1e-3, baseline=0.02, seed=7)

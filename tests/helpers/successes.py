@@ -34,6 +34,4 @@ def good(count: int) -> Table:
         penetration=np.full(count, 1e-3),
         imbalance=np.full(count, 0.01),
         normal_sum=np.full(count, 0.3),
-        certified_share=np.full(count, np.nan),
-        certified_friction=np.full(count, np.nan),
     )

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.datasets import CERTIFIED, make_dataset
+from helpers.datasets import REPEATED, make_dataset
 from helpers.golden import Golden, flat, rounded
 from helpers.pages import get
 from helpers.predictions import write_predictions
@@ -34,10 +34,10 @@ def tags(page: str, **replaced: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def certified(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def repeated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset with all columns that there are. Read only."""
     folder = tmp_path_factory.mktemp("golden")
-    return make_dataset(folder / "out", folder, overrides=CERTIFIED)
+    return make_dataset(folder / "out", folder, overrides=REPEATED)
 
 
 @pytest.mark.parametrize(
@@ -51,8 +51,8 @@ def certified(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("prediction_not_closed", "/prediction/2"),
     ],
 )
-def test_page(certified: Path, tmp_path: Path, golden: Golden, name: str, address: str) -> None:
-    inspection = Inspection(certified, write_predictions(certified, tmp_path / "run.h5"))
+def test_page(repeated: Path, tmp_path: Path, golden: Golden, name: str, address: str) -> None:
+    inspection = Inspection(repeated, write_predictions(repeated, tmp_path / "run.h5"))
     with TestClient(make_app(inspection), base_url="http://127.0.0.1:8321") as client:
         answer = get(client, address)
     assert answer.status_code == 200
@@ -60,4 +60,4 @@ def test_page(certified: Path, tmp_path: Path, golden: Golden, name: str, addres
     text = answer.text
     if name != "gallery":
         text = "".join(re.findall(r"<script type=.*?</script>|<main.*?</main>", text, re.DOTALL))
-    golden(f"pages/{name}", tags(text, OUT=certified, TOKEN=inspection.token))
+    golden(f"pages/{name}", tags(text, OUT=repeated, TOKEN=inspection.token))

@@ -80,7 +80,7 @@ class PackTask:
         ids: For each split the ids of the trials in the range that are samples, in rising order.
         firsts: For each split the row of the first of these samples.
         sizes: Lengths of the letters in the shapes of the fields.
-        certified: Whether the files have HOLD_FIELDS.
+        repeats: Whether the files have ROBUST_FIELDS.
     """
 
     out: str
@@ -91,10 +91,10 @@ class PackTask:
     ids: Mapping[str, npt.NDArray[np.int64]]
     firsts: Mapping[str, int]
     sizes: Mapping[str, int]
-    certified: bool
+    repeats: bool
 
 
-def pack_tasks(out: Path, decisions: Decisions, *, certified: bool) -> Iterator[PackTask]:
+def pack_tasks(out: Path, decisions: Decisions, *, repeats: bool) -> Iterator[PackTask]:
     """Yield the tasks that pack the rows, from the first to the last."""
     shards, ids = decisions.shards, decisions.ids
     slices, firsts = shards.slices, [piece.first for piece in shards.slices]
@@ -112,7 +112,7 @@ def pack_tasks(out: Path, decisions: Decisions, *, certified: bool) -> Iterator[
             ids={split: ids[split][a:b] for split, (a, b) in bounds.items()},
             firsts={split: int(a) for split, (a, _) in bounds.items()},
             sizes=shards.sizes,
-            certified=certified,
+            repeats=repeats,
         )
 
 
@@ -206,7 +206,7 @@ def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], Records, Images]:
     columns["trial_id"][:] = np.arange(task.start, task.stop)
     numbers = [
         (field.name, field.dtype, field.row_shape(task.sizes))
-        for field in stored_fields(DATA_FIELDS, certified=task.certified)
+        for field in stored_fields(DATA_FIELDS, repeats=task.repeats)
         if field.name not in (*IMAGES, *TEXTS)
     ]
     kind = np.dtype([("object", np.int32, ()), *numbers])
@@ -230,7 +230,7 @@ def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], Records, Images]:
 
 
 def _fields_of(task: PackTask) -> tuple[Field, ...]:
-    return stored_fields(TRIAL_FIELDS, certified=task.certified)
+    return stored_fields(TRIAL_FIELDS, repeats=task.repeats)
 
 
 def _add_samples(

@@ -28,7 +28,6 @@ from drakegrasp.dataset.quality import COLUMNS, suspicion
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import (
     CAMERAS,
-    CERTIFICATE_FIELDS,
     OBJECT_FIELDS,
     SUCCESS_FIELDS,
     sizes,
@@ -290,11 +289,7 @@ _COPIED = tuple(
     )
 )
 #: Columns of `/looks`, besides the depths of the otm image.
-LOOK_COLUMNS = (
-    *_MASKS,
-    *_CAMERAS,
-    *(field.name for field in CERTIFICATE_FIELDS),
-)
+LOOK_COLUMNS = (*_MASKS, *_CAMERAS)
 #: Columns of `/trials` from which the columns of successes follow.
 TRIAL_COLUMNS = sources_of(
     name
@@ -320,8 +315,7 @@ def successes_of(rows: Table, camera: CameraConfig, *, object: int = 0) -> Table
         "object": np.full(rows.count, object, dtype=np.int32),
     }
     rows = Table(with_derived(rows))
-    certificates = (field.name for field in CERTIFICATE_FIELDS)
-    found |= rows.only(*_COPIED, *certificates)
+    found |= rows.only(*_COPIED)
     for names, needs, derive in _DERIVED:
         if rows.has(*needs):
             found |= zip(names, derive(rows, camera), strict=True)
