@@ -13,11 +13,8 @@ if TYPE_CHECKING:
     from drakegrasp.api.building import build_dataset, make_benchmark
     from drakegrasp.api.scoring import score
     from drakegrasp.api.verifying import (
-        PlacedObject,
-        place_object,
         verify_grasp,
         verify_grasps,
-        verify_rows,
     )
     from drakegrasp.cluster.connect import connect
     from drakegrasp.config import Config
@@ -47,6 +44,7 @@ if TYPE_CHECKING:
     from drakegrasp.scoring.proposals import propose
     from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
+    from drakegrasp.simulation.placement import PlacedObject, place_object
     from drakegrasp.simulation.posture import Posture, make_posture, run_trial
     from drakegrasp.verification.result import PoseTrial, Verification
     from drakegrasp.vision.depth_image import cloud_from_depth, fit_table
@@ -70,7 +68,7 @@ _HOMES = {
     "MachineError": "errors",
     "MeshError": "errors",
     "Outcome": "outcomes",
-    "PlacedObject": "api.verifying",
+    "PlacedObject": "simulation.placement",
     "PoseTrial": "verification.result",
     "Posture": "simulation.posture",
     "Ranking": "scoring.ranking",
@@ -92,7 +90,7 @@ _HOMES = {
     "make_benchmark": "api.building",
     "make_posture": "simulation.posture",
     "pack_grasp": "grasp",
-    "place_object": "api.verifying",
+    "place_object": "simulation.placement",
     "propose": "scoring.proposals",
     "rank": "scoring.ranking",
     "replay_trial": "generation.replay",
@@ -102,7 +100,6 @@ _HOMES = {
     "unpack_grasp": "grasp",
     "verify_grasp": "api.verifying",
     "verify_grasps": "api.verifying",
-    "verify_rows": "api.verifying",
 }
 
 __all__ = [
@@ -153,7 +150,6 @@ __all__ = [
     "unpack_grasp",
     "verify_grasp",
     "verify_grasps",
-    "verify_rows",
 ]
 
 

@@ -20,12 +20,9 @@ from helpers.datasets import make_dataset
 from drakegrasp.api import building, verifying
 from drakegrasp.api.building import build_dataset, build_on
 from drakegrasp.api.verifying import (
-    PlacedObject,
-    place_object,
     run_verification,
     verify_grasp,
     verify_grasps,
-    verify_rows,
 )
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
@@ -39,8 +36,14 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import silent
-from drakegrasp.verification.hints import find_hints
-from drakegrasp.verification.placing import PlacedGrasp, place_on_object, place_on_rows
+from drakegrasp.simulation.placement import PlacedObject, place_object
+from drakegrasp.verification.hints import contact_readings
+from drakegrasp.verification.placing import (
+    PlacedGrasp,
+    dataset_config,
+    place_on_object,
+    place_on_rows,
+)
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import write_results
 from drakegrasp.verification.verify import verify_batch
@@ -81,9 +84,9 @@ def test_workers_change_nothing(test_split: GraspDataset, tmp_path: Path) -> Non
     rows = rows_of_two_objects(test_split)[:2]
     grasps = test_split.column("grasps")[rows].astype(float)
     config = read_manifest(test_split.path.parent).config
-    here = verify_rows(test_split, grasps, rows)
+    here = verify_grasps(grasps, test_split, rows=rows)
     with connect(2) as client:
-        there = verify_rows(test_split, grasps, rows, client=client)
+        there = verify_grasps(grasps, test_split, rows=rows, client=client)
     for name, results in (("here.h5", here), ("there.h5", there)):
         write_results(results, tmp_path / name, config)
     assert (tmp_path / "here.h5").read_bytes() == (tmp_path / "there.h5").read_bytes()
@@ -96,7 +99,7 @@ def test_results_come_in_the_order_of_the_grasps(cube: PlacedObject) -> None:
     off = GRASP.copy()
     off[0, 0] = np.nan
     order = [off, GRASP, off, GRASP]
-    results = cube.verify([g.ravel() for g in order], method="forces")
+    results = verify_grasps([g.ravel() for g in order], cube, method="forces")
     assert [v.outcome for v in results] == [
         Outcome.INVALID if g is off else Outcome.SUCCESS for g in order
     ]
@@ -108,7 +111,8 @@ def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
     rows = rows_of_two_objects(test_split)
     rows += rows
     names = test_split.column("object_props/object_name")[rows]
-    placed = place_on_rows(test_split.column("grasps")[rows], test_split, rows)
+    config, grasps = dataset_config(test_split), test_split.column("grasps")[rows]
+    placed = place_on_rows(grasps, test_split, rows, config=config)
     assert sorted(grasp.index for grasp in placed) == list(range(len(rows)))
     of_objects = [grasp.placed.model.name for grasp in placed]
     assert of_objects == names[[grasp.index for grasp in placed]].tolist()
@@ -146,19 +150,19 @@ def test_workers_get_tasks_of_few_grasps(
     def execute(_: object, tasks: Iterable[list[PlacedGrasp]]) -> Iterator[object]:
         for task in tasks:
             given.append(len(task))
-            yield [(grasp.index, result) for grasp in task]
+            yield [(grasp.index, result.findings) for grasp in task]
 
     monkeypatch.setattr(verifying, "joined", lambda *_: nullcontext(client))
     monkeypatch.setattr(verifying, "admitted_workers", lambda *_: nullcontext())
     monkeypatch.setattr(verifying, "DaskExecutor", lambda _: execute)
     placed = place(np.tile(GRASP.ravel(), (count, 1)), cube)
-    run_verification(placed, client=client, show=False)  # type: ignore[arg-type]
+    run_verification(placed, cube.config, client=client, show=False)  # type: ignore[arg-type]
     assert given == sizes
 
 
 @pytest.mark.parametrize("where", [{}, {"frame": "camera", "X_TC": np.eye(4)}])
 def test_no_grasps_are_no_work(cube: PlacedObject, where: dict) -> None:
-    assert cube.verify(np.zeros((0, 18)), **where) == []
+    assert verify_grasps(np.zeros((0, 18)), cube, **where) == []
 
 
 def test_object_goes_to_a_worker_with_many_grasps_and_does_not_come_back(
@@ -187,12 +191,17 @@ def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
     rows = list(range(len(test_split)))
 
     def hints(grasps: np.ndarray, frame: str) -> set[str]:
-        placed = place_on_rows(grasps, test_split, rows, frame=frame)
-        return {hint for g in placed for hint in find_hints(g, *g.contacts())}
+        config = dataset_config(test_split)
+        placed = place_on_rows(grasps, test_split, rows, config=config, frame=frame)
+        return {
+            reading.text
+            for grasp in placed
+            for reading in contact_readings(grasp, grasp.in_object_frame()[1], fits=False)
+        }
 
     own = test_split.column("grasps")
     assert "the frame of the dataset's other camera" in hints(other.column("grasps"), "camera")
-    assert hints(own, "object") == hints(own, "workspace") == {"the camera's frame (camera)"}
+    assert hints(own, "object") == hints(own, "table") == {"the camera's frame (camera)"}
     assert not hints(own, "camera")
 
 
@@ -228,7 +237,7 @@ def test_contacts_in_the_frame_of_the_mesh_file_are_told_and_read_on_a_sample(
 def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, words: str) -> None:
     grasps = test_split.column("grasps")[:1]
     with pytest.raises(GraspError, match=words):
-        verify_rows(test_split, grasps, rows)
+        verify_grasps(grasps, test_split, rows=rows)
 
 
 @pytest.mark.parametrize(
@@ -270,8 +279,8 @@ def test_one_grasp_of_a_dataset_names_its_row(test_split: GraspDataset) -> None:
         verify_grasp(grasp, test_split)
     with pytest.raises(GraspError, match=r"row must be one whole number, got \[0\]"):
         verify_grasp(grasp, test_split, row=[0])
-    with pytest.raises(GraspError, match=r"one grasp must be a vector, .*\(1, 18\); many go into"):
-        verify_grasp(grasp[None], test_split, row=0)
+    with pytest.raises(GraspError, match="one grasp must be a vector, got 2 grasps; many go into"):
+        verify_grasp([grasp, grasp], test_split, row=0)
     with pytest.raises(GraspError, match="rows must be None on a Sample, which is one row, got"):
         verify_grasp(grasp, test_split[0], row=0)
 
@@ -301,8 +310,6 @@ def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: P
     ]  # fmt: skip
     assert all(verdict.success for verdict in on_mesh)
     assert len({verdict.epsilon for verdict in on_mesh}) == 1
-    (by_object,) = placed.verify(GRASP.ravel(), method="forces")
-    assert same(by_object, on_mesh[-1])
 
     # A sample is its row, also as a copy, in another process, and of a slice.
     row = len(test_split) - 1
@@ -320,7 +327,7 @@ def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: P
         assert same(by_row, verify_grasp(sample.grasp, each, method="forces"))
     pair = verify_grasps([sample.grasp, sample.grasp], sample, method="forces")
     assert [same(by_row, each) for each in pair] == [True, True]
-    (by_rows,) = verify_rows(test_split, sample.grasp, [row], method="forces")
+    (by_rows,) = verify_grasps(sample.grasp, test_split, rows=[row], method="forces")
     assert same(by_row, by_rows)
 
 
@@ -396,7 +403,7 @@ def test_one_worker_is_this_process(cube: PlacedObject, monkeypatch: pytest.Monk
     monkeypatch.setattr(f"{module}.FEW_GRASPS", 0)
     monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
     grasps = place(GRASP.ravel(), cube)
-    assert run_verification(grasps, workers=1, show=False) == [run_here]
+    assert run_verification(grasps, cube.config, workers=1, show=False) == [run_here]
 
 
 def test_few_grasps_are_verified_in_this_process(
@@ -407,9 +414,9 @@ def test_few_grasps_are_verified_in_this_process(
     monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
     monkeypatch.setattr(f"{module}.joined", lambda *_: _none())
     four, five = (place([GRASP.ravel()] * count, cube) for count in (4, 5))
-    assert run_verification(four, show=False) == [run_here]
+    assert run_verification(four, cube.config, show=False) == [run_here]
     with pytest.raises(MachineError, match="no workers"):
-        run_verification(five, show=False)
+        run_verification(five, cube.config, show=False)
 
 
 def test_workers_are_asked_whether_they_see_the_meshes_of_a_build(

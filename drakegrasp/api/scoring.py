@@ -25,7 +25,7 @@ from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Method, Score
 from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspRows
 from drakegrasp.verification.placing import (
     PlacedGrasp,
     dataset_config,
@@ -98,6 +98,7 @@ def score(
     if unknown:
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
     settings = ("verify.max_tries=1", *overrides)
+    used = dataset_config(dataset, overrides=settings)
     name, ranked = ranked_sets(
         predictions, dataset, rows=rows, confidence=confidence, read_as=read_as
     )
@@ -111,8 +112,8 @@ def score(
         require_mujoco("mujoco", "coacd")
 
     # The verdicts, from this process or from workers.
-    def try_all(grasps: Attempts, chosen: Sequence[int], deliver: Deliver) -> None:
-        placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
+    def try_all(grasps: GraspRows, chosen: Sequence[int], deliver: Deliver) -> None:
+        placed = place_on_rows(grasps, dataset, chosen, config=used, overrides=settings)
         if peer:
             keep = Path(scratch if out is None else out) / CONVEX_PARTS
             count = workers.get("workers")
@@ -120,9 +121,11 @@ def score(
             return
         run_verification(
             placed,
+            used,
             client=client,
             on_result=lambda index, result: deliver(index, verdict_of(result)),
             show=show,
+            explained=False,
             **workers,
         )
 
@@ -136,7 +139,7 @@ def score(
             against=other,
             references=references,
             per_object=per_object,
-            config=dataset_config(dataset, overrides=settings),
+            config=used,
             overridden=overridden_keys(settings),
             again=again,
             protocol={**describe(rule, stored), "versions": _versions()} if peer else None,

@@ -1,16 +1,15 @@
 """Verifying grasps, on Dask workers or in this process.
 
 `verify_grasp` and `verify_grasps` verify grasps on everything that a grasp can be on: a mesh, a
-placed object, a sample, or a dataset. The other functions are short forms of them.
+placed object, a sample, or a dataset.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -23,14 +22,16 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange.contacts import HDF5_SUFFIXES
-from drakegrasp.frames import as_numbers
-from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.simulation.placement import Placed, config_for
-from drakegrasp.simulation.placement import PlacedObject as ObjectOnTable
-from drakegrasp.simulation.placement import place_object as put_on_table
-from drakegrasp.verification.placing import PlacedGrasp, place_on_object, place_on_rows
+from drakegrasp.simulation.placement import Placed, place_object
+from drakegrasp.verification.placing import (
+    PlacedGrasp,
+    RowChoice,
+    dataset_config,
+    place_on_object,
+    place_on_rows,
+)
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import ResultCallback, ignore_result, verify_batch
 
@@ -47,19 +48,6 @@ FEW_GRASPS = 4
 #: Largest number of grasps of one object in a task, and smallest number of tasks per worker, so
 #: that no worker is idle at the end.
 MOST_TOGETHER, TASKS_PER_WORKER = 16, 4
-
-
-class How(TypedDict, total=False):
-    """Arguments that several functions of this module share; see `verify_grasps`."""
-
-    frame: str | None
-    X_TC: npt.ArrayLike | None
-    units: str | None
-    X_TO: npt.ArrayLike | None
-    hand: str | Path | None
-    method: str
-    snap_points: bool
-    config: Config | None
 
 
 def verify_grasp(
@@ -104,22 +92,14 @@ def verify_grasp(
         GraspError: If the grasp is not a vector, or as `verify_grasps`.
         MeshError, ConfigError, HandError, DataError: As `verify_grasps`.
     """
-    # Require one grasp, and one row if a row is needed.
-    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
-    if vector.ndim != 1:
-        raise GraspError(
-            f"one grasp must be a vector, got an array of shape {vector.shape}; many go into "
-            "verify_grasps"
-        )
     if row is not None and np.ndim(row):
         raise GraspError(f"row must be one whole number, got {row!r}")
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
-
-    (verdict,) = verify_grasps(
-        vector,
+    placed, used = _place(
+        grasp,
         on,
-        rows=None if row is None else [row],
+        row,
         frame=frame,
         X_TC=X_TC,
         units=units,
@@ -129,6 +109,11 @@ def verify_grasp(
         snap_points=snap_points,
         config=config,
     )
+    if len(placed) != 1:
+        raise GraspError(
+            f"one grasp must be a vector, got {len(placed)} grasps; many go into verify_grasps"
+        )
+    (verdict,) = run_verification(placed, used, show=False, explained=False)
     return verdict
 
 
@@ -193,47 +178,76 @@ def verify_grasps(
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
-    _refuse_other_targets(on)
-    how: dict[str, Any] = {"hand": hand, "config": config, "method": method}
-    how["snap_points"] = snap_points
-    if isinstance(on, Sample | GraspDataset):
-        fixed = {"X_TC": X_TC, "units": units, "X_TO": X_TO}
-        placed = _place_on_rows(grasps, on, rows, fixed, frame=frame or "camera", **how)
-        return run_verification(placed, client=client, show=show)
-    if rows is not None:
-        raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
-    thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
-    placed = place_on_object(
-        grasps, thing, frame=frame or "object", X_TC=X_TC, method=method, snap_points=snap_points
+    placed, used = _place(
+        grasps,
+        on,
+        rows,
+        frame=frame,
+        X_TC=X_TC,
+        units=units,
+        X_TO=X_TO,
+        hand=hand,
+        method=method,
+        snap_points=snap_points,
+        config=config,
     )
-    return run_verification(placed, client=client, show=show)
+    return run_verification(placed, used, client=client, show=show, explained=False)
 
 
-def _place_on_rows(
+def _place(
     grasps: npt.ArrayLike,
-    on: Sample | GraspDataset,
-    rows: Sequence[int] | None,
-    fixed: Mapping[str, object],
-    **how: Any,
-) -> list[PlacedGrasp]:
-    """Return grasps on rows, which define the object, its pose, and the cameras."""
+    on: GraspTarget,
+    rows: RowChoice,
+    *,
+    frame: str | None,
+    X_TC: npt.ArrayLike | None,
+    units: str | None,
+    X_TO: npt.ArrayLike | None,
+    hand: str | Path | None,
+    method: str,
+    snap_points: bool,
+    config: Config | None,
+) -> tuple[list[PlacedGrasp], Config]:
+    """Return the grasps on their target, and the configuration; see `verify_grasps`."""
+    _refuse_other_targets(on)
+    if not isinstance(on, Sample | GraspDataset):
+        if rows is not None:
+            raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
+        thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
+        placed = place_on_object(
+            grasps,
+            thing,
+            frame=frame or "object",
+            X_TC=X_TC,
+            method=method,
+            snap_points=snap_points,
+        )
+        return placed, thing.config
+    _refuse_given(on, X_TC=X_TC, units=units, X_TO=X_TO)
+    if isinstance(on, Sample) and rows is not None:
+        raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
+    data, rows = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
+    used = dataset_config(data, config, hand)
+    placed = place_on_rows(
+        grasps,
+        data,
+        rows,
+        config=used,
+        drawn=config is None,
+        frame=frame or "camera",
+        method=method,
+        snap_points=snap_points,
+    )
+    return placed, used
+
+
+def _refuse_given(on: Sample | GraspDataset, **fixed: object) -> None:
+    """Reject values that the rows of a dataset define."""
     for name, value in fixed.items():
         if value is not None:
             raise GraspError(
                 f"{name} must be None on a {type(on).__name__}, which defines it, got a value"
             )
-    if isinstance(on, Sample) and rows is not None:
-        raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
-    data, chosen = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
-    placed = place_on_rows(grasps, data, chosen, **how)
-
-    # The user can verify more grasps on the object of a verdict.
-    things = {id(thing): thing for grasp in placed for thing in grasp.stands}
-    doors = {
-        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
-        for key, thing in things.items()
-    }
-    return [replace(g, stands=tuple(doors[id(thing)] for thing in g.stands)) for g in placed]
 
 
 def _refuse_other_targets(on: object) -> None:
@@ -248,74 +262,14 @@ def _refuse_other_targets(on: object) -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class PlacedObject(ObjectOnTable):
-    """An object on the table, on which grasps can be verified; created by `place_object`."""
-
-    def verify(
-        self,
-        grasps: npt.ArrayLike,
-        *,
-        client: Client | None = None,
-        show: bool = False,
-        **how: Unpack[How],
-    ) -> list[Verification]:
-        """Return `verify_grasps(grasps, self, ...)`, the verdicts on grasps of this object."""
-        return verify_grasps(grasps, self, client=client, show=show, **how)
-
-
-def place_object(
-    mesh: ObjectMesh,
-    *,
-    units: str | None = None,
-    X_TO: npt.ArrayLike | None = None,
-    hand: str | Path | None = None,
-    config: Config | None = None,
-) -> PlacedObject:
-    """Return an object on the table, prepared once for any number of grasps.
-
-    Args:
-        mesh: Path of a mesh file, a mesh, or a placed object. The origin of {O} is the centre of
-            the bounding box, not the origin of the file.
-        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` in
-            the folder of the mesh overrides it. Grasps are always in metres.
-        X_TO: Pose of the object on the table, (4, 4); if None, the object is dropped as in a build.
-        hand: Name or YAML file of the hand; None for the configuration's ("barrett").
-        config: Hand, physics, lift and rules; None for those of a placed object, or else the
-            defaults.
-
-    Raises:
-        MeshError: If the mesh cannot be simulated or does not come to rest.
-        GraspError: If X_TO is not a pose or does not put the object on the table.
-        ConfigError: If config is not a `Config`, or the object was placed with other values.
-        HandError: If the hand cannot be used.
-    """
-    used = config_for(mesh, config)
-    if hand is not None:
-        used = override_config(used, [], hand=str(hand))
-    placed = put_on_table(mesh, units=units, X_TO=X_TO, config=used)
-    return PlacedObject(model=placed.model, X_TO=placed.X_TO, config=placed.config)
-
-
-def verify_rows(
-    data: GraspDataset,
-    predictions: npt.ArrayLike,
-    rows: Sequence[int] | None = None,
-    *,
-    client: Client | None = None,
-    show: bool = False,
-    **how: Unpack[How],
-) -> list[Verification]:
-    """Return `verify_grasps(predictions, data, rows=rows, ...)`, the verdicts on rows' grasps."""
-    return verify_grasps(predictions, data, rows=rows, client=client, show=show, **how)
-
-
 def run_verification(
     grasps: Sequence[PlacedGrasp],
+    config: Config,
     *,
     client: Client | None = None,
     on_result: ResultCallback = ignore_result,
     show: bool = True,
+    explained: bool = True,
     **workers: Unpack[Workers],
 ) -> list[Verification]:
     """Return the verdicts on placed grasps in the caller's order; the work of `drakegrasp verify`.
@@ -325,9 +279,11 @@ def run_verification(
 
     Args:
         grasps: See `verification.placing`.
+        config: The configuration, whose hand all workers must have.
         client: A Dask client whose workers do the work.
         on_result: Is called with each verdict in the caller's order, once all earlier ones exist.
         show: Whether to show progress on standard error.
+        explained: See `verify_batch`.
         workers: The arguments of `connect`, instead of a client.
 
     Raises:
@@ -341,12 +297,14 @@ def run_verification(
     alone = not elsewhere and (few or count_workers(workers.get("workers")) == 1)
     if cluster is None or alone or not grasps:
         with progress_bar("verify", "grasps", show=show) as report:
-            return verify_batch(grasps, run_here, report, on_result)
+            return verify_batch(grasps, run_here, report, on_result, explained=explained)
     with (
         cluster as joint,
         progress_bar("verify", "grasps", show=show) as report,
-        admitted_workers(joint, grasps[0].config),
+        admitted_workers(joint, config),
     ):
         tasks = TASKS_PER_WORKER * max(len(joint.nthreads()), 1)
         together = min(max(len(grasps) // tasks, 1), MOST_TOGETHER)
-        return verify_batch(grasps, DaskExecutor(joint), report, on_result, together=together)
+        return verify_batch(
+            grasps, DaskExecutor(joint), report, on_result, together=together, explained=explained
+        )

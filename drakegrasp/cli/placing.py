@@ -23,7 +23,7 @@ from drakegrasp.exchange.contacts import HDF5_SUFFIXES, read_numbers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_mesh
-from drakegrasp.simulation.attempts import Attempts, ranked
+from drakegrasp.simulation.attempts import Attempts, Rows, ranked
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.verification.placing import (
     PlacedGrasp,
@@ -33,6 +33,7 @@ from drakegrasp.verification.placing import (
     place_on_object,
     place_on_rows,
 )
+from drakegrasp.verification.prediction import ContactRows
 from drakegrasp.verification.result_files import refuse_unwritable
 
 #: Upper bound of the number of rows of a split.
@@ -141,7 +142,7 @@ def _place_on_mesh(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config, N
     if table.of_row is not None:
         raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
     placed = place_on_object(
-        _ranked(table, table.objects),
+        _ranked(table, table.objects if isinstance(table, Attempts) else [name] * len(table)),
         place_object(request.mesh, units=request.units, config=config),
         frame=request.frame or "object",
         X_TC=None if request.camera is None else read_numbers(request.camera),
@@ -178,14 +179,15 @@ def _place_on_rows(
         _ranked(table, rows),
         data,
         rows,
+        config=config,
+        drawn=given is None,
         frame=request.frame or "camera",
-        hand=request.hand,
         method=request.method,
         snap_points=request.snap_points,
-        config=given,
         overrides=overrides,
     )
-    for told in filter(None, (table.bare, table.left_out)):
+    bare = table.bare if isinstance(table, Attempts) else ""
+    for told in filter(None, (bare, table.left_out)):
         say(told, err=True)
     return placed, config, PredictedRows.of(path, data.split, rows)
 
@@ -199,6 +201,7 @@ def _place_on_objects(
     table = read_attempts(
         request.grasps, load_hand(config.hand_source), read_as=chosen_reading(vars(request))
     )
+    assert isinstance(table, Attempts)
     _say_nameless(table)
     own = config if request.overrides else None
     table = _ranked(table, table.objects)
@@ -234,7 +237,7 @@ def _rows_of(
     return found
 
 
-def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
+def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts | ContactRows:
     """Return the grasps of a file or a folder that belong to an object, and print the others.
 
     If all rows of a file name one other object, the file is used for this object.
@@ -246,6 +249,8 @@ def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
     table = read_attempts(
         path, hand, of=name, split=request.split, read_as=chosen_reading(vars(request))
     )
+    if isinstance(table, ContactRows):
+        return table
     own = [i for i, each in enumerate(table.objects) if each in ("", name)]
     others = sorted(set(table.objects) - {"", name})
     if not others:
@@ -263,13 +268,15 @@ def _of_object(request: VerifyRequest, name: str, hand: Hand) -> Attempts:
     return table
 
 
-def _ranked(table: Attempts, of: Sequence[str] | npt.NDArray[np.int64]) -> Attempts:
+def _ranked(table: Rows, of: Sequence[str] | npt.NDArray[np.int64]) -> Rows:
     """Return a table with the ranks by the confidence that a file states, if it does."""
     return table if table.confidence is None else ranked(table, of)
 
 
-def _say_nameless(table: Attempts) -> None:
+def _say_nameless(table: Attempts | ContactRows) -> None:
     """Print how many postures specify no resting pose, and how many have no joints."""
+    if isinstance(table, ContactRows):
+        return
     for told in filter(None, (table.nameless, table.bare)):
         say(told, err=True)
 

@@ -161,7 +161,7 @@ def _verify_by_lift(
     # Lines are written as verdicts arrive, so an interrupted run keeps the finished ones.
     try:
         with text_lines(out, echo=as_json) as write:
-            results = run_verification(grasps, **workers, on_result=deliver, show=not quiet)
+            results = run_verification(grasps, config, **workers, on_result=deliver, show=not quiet)
             if out is not None:
                 write_results(results, result_paths(out)[1], config, rows)
     except BaseException:

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, overload
 
 import h5py
 import numpy as np
@@ -55,7 +55,7 @@ from drakegrasp.simulation.attempts import (
 )
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.verification.placing import choose_rows, read_several
-from drakegrasp.verification.prediction import read_grasps
+from drakegrasp.verification.prediction import ContactRows, read_grasps
 
 #: Values that a file states once for all its rows.
 _OF_FILE = ("frame", "link", "joints", "hand", "gripper", "of_objects")
@@ -80,6 +80,24 @@ _KNOWN = (
 )
 
 
+@overload
+def read_attempts(
+    path: Path, hand: Hand, *, of: None = None, read_as: Mapping[str, str] | None = None
+) -> Attempts: ...
+
+
+@overload
+def read_attempts(
+    path: Path,
+    hand: Hand,
+    *,
+    of: str | GraspDataset | None,
+    split: str | None = None,
+    several: bool = False,
+    read_as: Mapping[str, str] | None = None,
+) -> Attempts | ContactRows: ...
+
+
 def read_attempts(
     path: Path,
     hand: Hand,
@@ -88,7 +106,7 @@ def read_attempts(
     split: str | None = None,
     several: bool = False,
     read_as: Mapping[str, str] | None = None,
-) -> Attempts:
+) -> Attempts | ContactRows:
     """Return the postures or contacts of a file, or the postures of a folder of files, as a table.
 
     An invalid row stays in the table, with the reason. An invalid file of a folder is one such row.

@@ -366,12 +366,12 @@ def fitted_postures(
     def posture_of(i: int, grasp: PlacedGrasp) -> Posture | str:
         if grasp.invalid or i in fitted:
             return grasp.invalid or fitted[i]
-        if np.isnan(grasp.attempt.q_grasp).all():
+        if grasp.postures[0].q_grasp is None:
             return "joints must be given with a protocol, got a palm pose alone"
         # The prediction does not name the resting pose.
         if (count := len(grasp.stands)) > 1:
             return f"resting must be 0 to {count - 1} with a protocol, got none"
-        return grasp.posture(grasp.placed)
+        return grasp.postures[0]
 
     return [(grasp.placed, posture_of(i, grasp)) for i, grasp in enumerate(grasps)]
 

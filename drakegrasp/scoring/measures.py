@@ -20,7 +20,7 @@ import numpy.typing as npt
 from drakegrasp.frames import Array
 from drakegrasp.scoring.verdict import Verdict
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspRows
 from drakegrasp.table import Table
 
 #: A mean over objects by "value", and the ends of its interval by "low" and "high".
@@ -90,7 +90,7 @@ class Judged:
     """
 
     name: str
-    ranked: tuple[Attempts, ...]
+    ranked: tuple[GraspRows, ...]
     verdicts: tuple[tuple[Verdict, ...], ...]
 
     @cached_property

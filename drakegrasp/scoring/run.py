@@ -28,12 +28,12 @@ from drakegrasp.scoring.measures import Grouping, Judged
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.verdict import Verdict, VerdictFile, rank_array, verdict_key
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.attempts import Attempts, join_attempts
+from drakegrasp.simulation.attempts import Attempts, GraspRows, Rows, join_rows
 
 #: Tries n attempts on rows (n,), and calls back with the index and the verdict of each.
-Verify: TypeAlias = Callable[[Attempts, Sequence[int], Callable[[int, Verdict], None]], object]
+Verify: TypeAlias = Callable[[GraspRows, Sequence[int], Callable[[int, Verdict], None]], object]
 #: The name of a method on a card, and its predictions by training seed.
-Method: TypeAlias = tuple[str, tuple[Attempts, ...]]
+Method: TypeAlias = tuple[str, tuple[GraspRows, ...]]
 #: Files of a score.
 CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"
 
@@ -81,7 +81,7 @@ def score(
     verify: Verify,
     *,
     train: GraspDataset,
-    predictions: Sequence[Attempts],
+    predictions: Sequence[GraspRows],
     name: str,
     against: Method | None,
     references: Sequence[str],
@@ -181,7 +181,7 @@ def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
 
 
 def _chosen_rows(
-    data: GraspDataset, predictions: Sequence[Attempts], per_object: int | None
+    data: GraspDataset, predictions: Sequence[GraspRows], per_object: int | None
 ) -> list[int]:
     """Return the rows to score, in order: rows of the predictions, at most `per_object` each."""
     if per_object is not None and per_object < 1:
@@ -224,7 +224,7 @@ def _grouping(data: GraspDataset, rows: Sequence[int]) -> Grouping:
 
 
 def _verdicts(
-    sets: Sequence[Attempts],
+    sets: Sequence[GraspRows],
     data: GraspDataset,
     settings: Mapping[str, Any],
     verify: Verify,
@@ -235,9 +235,11 @@ def _verdicts(
     content = f"{data.content} {data.camera}"
     keys = []
     for each in sets:
-        # Palm poses alone may differ only in their preshape.
-        frame = "" if each.grasps is not None else f" posture in {each.frame}"
-        shapes = [name and f" of {name}" for name in each.preshape]
+        frame, shapes = "", [""] * len(each)
+        if isinstance(each, Attempts):
+            # Palm poses alone may differ only in their preshape.
+            frame = f" posture in {each.frame}"
+            shapes = [name and f" of {name}" for name in each.preshape]
         numbers = zip(shapes, each.of_row.tolist(), each.numbers(), strict=True)
         keys.append([verdict_key(settings, content + frame + s, *of) for s, *of in numbers])
 
@@ -247,11 +249,11 @@ def _verdicts(
     known = VerdictFile(None if folder is None else folder / VERDICTS)
     objects = data.column("object_props/object_name").tolist()
     resting = data.column("grasp_props/resting").tolist()
-    contacts = [k for k, each in enumerate(sets) if each.grasps is not None]
+    contacts = [k for k, each in enumerate(sets) if not isinstance(each, Attempts)]
     postures = [[k] for k in range(len(sets)) if k not in contacts]
     try:
         for part in [contacts, *postures] if contacts else postures:
-            table = join_attempts([sets[k] for k in part])
+            table = join_rows([sets[k] for k in part])
             place = dict[str, tuple[str, int, int, int]]()
             for i, key in enumerate(key for k in part for key in keys[k]):
                 row = int(table.of_row[i])
@@ -277,7 +279,7 @@ def _keep(known: VerdictFile, keys: Sequence[str], index: int, verdict: Verdict)
     known.add(keys[index], verdict)
 
 
-def _of_rows(table: Attempts, rows: Sequence[int]) -> Attempts:
+def _of_rows(table: Rows, rows: Sequence[int]) -> Rows:
     """Return the predictions for some rows."""
     return table.at(np.flatnonzero(np.isin(table.of_row, rows)).tolist())
 

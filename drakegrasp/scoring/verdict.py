@@ -27,12 +27,12 @@ from drakegrasp.frames import Array, as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
-from drakegrasp.simulation.attempts import EACH, Attempts, ranked
+from drakegrasp.simulation.attempts import EACH, Attempts, GraspRows, Rows, ranked
 from drakegrasp.verification.placing import PlacedGrasp, dataset_config, read_several
 from drakegrasp.verification.result import Verification
 
 
-def rank(table: Attempts) -> Attempts:
+def rank(table: Rows) -> Rows:
     """Return predictions for rows of a split, ordered by row and by rank within a row."""
     table = ranked(table, table.of_row)
     return table.at(np.lexsort((table.rank, table.of_row)).tolist())
@@ -40,11 +40,11 @@ def rank(table: Attempts) -> Attempts:
 
 def rank_array(
     name: str,
-    grasps: npt.ArrayLike | Attempts,
+    grasps: npt.ArrayLike | GraspRows,
     data: GraspDataset,
     rows: Sequence[int] | npt.NDArray[np.int64] | None = None,
     confidence: npt.ArrayLike | None = None,
-) -> Attempts:
+) -> GraspRows:
     """Return predicted contacts of an array, ranked; see `read_several`.
 
     A table of predictions for rows is only ranked.
@@ -59,7 +59,7 @@ def rank_array(
     Raises:
         GraspError: If the predictions cannot be used.
     """
-    if isinstance(grasps, Attempts):
+    if isinstance(grasps, GraspRows):
         sha256 = hashlib.sha256(np.ascontiguousarray(grasps.numbers()).tobytes()).hexdigest()
         return rank(replace(grasps, file=name, sha256=sha256))
     fingers = data.column("grasps").shape[1] // 6
@@ -70,7 +70,9 @@ def rank_array(
         return rank(replace(table, file=name, sha256=sha256))
 
 
-def rank_file(path: Path, data: GraspDataset, read_as: Mapping[str, str] | None = None) -> Attempts:
+def rank_file(
+    path: Path, data: GraspDataset, read_as: Mapping[str, str] | None = None
+) -> GraspRows:
     """Return the predictions of a file, ranked; see `read_attempts`.
 
     Raises:
@@ -80,7 +82,7 @@ def rank_file(path: Path, data: GraspDataset, read_as: Mapping[str, str] | None 
     hand = load_hand(dataset_config(data).hand_source)
     table = read_attempts(path, hand, of=data, several=True, read_as=read_as)
     with named(path):
-        if table.grasps is None and EACH in table.preshape:
+        if isinstance(table, Attempts) and EACH in table.preshape:
             raise GraspError(
                 f"preshape must be one for a score, which tries nothing twice, got {EACH}"
             )
@@ -94,7 +96,7 @@ def ranked_sets(
     rows: Sequence[int] | None = None,
     confidence: npt.ArrayLike | None = None,
     read_as: Mapping[str, str] | None = None,
-) -> tuple[str, tuple[Attempts, ...]]:
+) -> tuple[str, tuple[GraspRows, ...]]:
     """Return the name of the scored method, and its predictions by training seed.
 
     Args:
@@ -209,7 +211,7 @@ def protocol_verdict(grasp: PlacedGrasp, found: PostureVerdict) -> Verdict:
         **dict.fromkeys(measures, found.success),
         contact_error=None,
         penetration=_rounded(found.penetration) if math.isfinite(found.penetration) else None,
-        contacts=_tuple(grasp.contacts()[0]),
+        contacts=_tuple(grasp.in_object_frame()[0]),
         posture=(),
         seconds=0.0,
         reason=found.reason.partition(": ")[2] if outcome == Outcome.INVALID.label else "",

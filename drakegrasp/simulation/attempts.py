@@ -12,7 +12,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -69,10 +69,66 @@ CONDITIONS = ("friction_hand", "friction_table", "mass")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Attempts:
-    """n postures of hands with j joints in the plant's order, built by `make_attempts`.
+class GraspRows:
+    """n grasps from outside, one in a row: what contacts and postures have in common.
 
-    Or n grasps of k contacts without wrist and joints, built by `read_grasps`.
+    Attributes:
+        row: (n,), row in the file.
+        invalid: (n,), reason why a row is not a valid grasp; empty for a valid row.
+        of_row: (n,), for predictions: row of the dataset's split that each prediction is for.
+        confidence: (n,), for predictions: greater is better.
+        rank: (n,), for predictions: 0 for the best prediction of its row or object, see `ranked`.
+        file, sha256: Source of predictions to score, and its hash.
+        without_rows: For predictions: objects that the files name and the split has no row of.
+    """
+
+    row: npt.NDArray[np.int64]
+    invalid: tuple[str, ...]
+    of_row: Any = None
+    confidence: Any = None
+    rank: Any = None
+    file: str = ""
+    sha256: str = ""
+    without_rows: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.invalid)
+
+    def __iter__(self) -> Iterator[tuple[str, Any]]:
+        """Yield name and values of each column of the table."""
+        for f in fields(self):
+            if f.name not in _OF_ALL and (value := getattr(self, f.name)) is not None:
+                yield f.name, value
+
+    def at(self, rows: Sequence[int]) -> Self:
+        """Return some rows, in the given order."""
+        chosen: dict[str, Any] = {name: taken(value, rows) for name, value in self}
+        return replace(self, **chosen)
+
+    def numbers(self) -> Array:
+        """Return all numbers (n, m) that describe the rows; NaN for numbers that a row lacks."""
+        raise NotImplementedError
+
+    def refuse(self, reasons: Sequence[str]) -> Self:
+        """Return the table with additional reasons (n,) why rows are not valid."""
+        both = (one or other for one, other in zip(self.invalid, reasons, strict=True))
+        return replace(self, invalid=tuple(both))
+
+    @property
+    def left_out(self) -> str:
+        """A message on the objects of which the split has no row; empty if there are none."""
+        if not self.without_rows:
+            return ""
+        return f"grasps are left out, as the split has no row of {listed(self.without_rows)}"
+
+
+#: A table of contacts or of postures.
+Rows = TypeVar("Rows", bound=GraspRows)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempts(GraspRows):
+    """n postures of hands with j joints in the plant's order, built by `make_attempts`.
 
     Attributes:
         objects: (n,), name of the object of each row.
@@ -91,20 +147,9 @@ class Attempts:
         preshape: (n,), name of the hand's preshape; empty if all fingers close; or `EACH`.
         conditions: (n, 3), the `CONDITIONS` under which the grasp held; NaN if unknown.
             Verification uses them; a build draws its own conditions.
-        row: (n,), row in the file.
-        invalid: (n,), reason why a row is not a valid posture; empty for a valid row.
-        of_row: (n,), for predictions: row of the dataset's split that each prediction is for.
-        confidence: (n,), for predictions: greater is better.
         link: Frame that the file gives poses of instead of the palm frame, shown in hints: the palm
             link or a frame of another tool; empty for the palm frame.
         X_FG_xyzw: (n, 4, 4), for hints: X_FG read with the quaternions in the order x, y, z, w.
-        grasps: (n, 6k), for contacts: the numbers as they were given; None for postures.
-        points, normals: (n, k, 3), contact points [m] and unit normals in the frame of the
-            caller; NaN in rows without a valid grasp.
-        normalised: (n,), whether a normal was not of unit length.
-        rank: (n,), for predictions: 0 for the best prediction of its row or object, see `ranked`.
-        file, sha256: Source of predictions to score, and its hash.
-        without_rows: For predictions: objects that the files name and the split has no row of.
     """
 
     objects: tuple[str, ...]
@@ -120,39 +165,13 @@ class Attempts:
     said: tuple[str, ...]
     preshape: tuple[str, ...]
     conditions: Array
-    row: npt.NDArray[np.int64]
-    invalid: tuple[str, ...]
-    of_row: Any = None
-    confidence: Any = None
     link: str = ""
     X_FG_xyzw: Array | None = None
-    grasps: Array | None = None
-    points: Array | None = None
-    normals: Array | None = None
-    normalised: npt.NDArray[np.bool_] | None = None
-    rank: Any = None
-    file: str = ""
-    sha256: str = ""
-    without_rows: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.objects)
-
-    def __iter__(self) -> Iterator[tuple[str, Any]]:
-        """Yield name and values of each column of the table."""
-        for f in fields(self):
-            if f.name not in _OF_ALL and (value := getattr(self, f.name)) is not None:
-                yield f.name, value
 
     def of_object(self, name: str) -> Attempts:
         """Return the valid rows of an object, in their order."""
         said = zip(self.objects, self.invalid, strict=True)
         return self.at([i for i, (each, reason) in enumerate(said) if each == name and not reason])
-
-    def at(self, rows: Sequence[int]) -> Attempts:
-        """Return some rows, in the given order."""
-        chosen: dict[str, Any] = {name: taken(value, rows) for name, value in self}
-        return replace(self, **chosen)
 
     def posture(self, i: int, X_TO: Array, X_OM: Array | None = None) -> Posture:
         """Return the posture of a row.
@@ -170,16 +189,7 @@ class Attempts:
 
     def frame_pose(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
         """Return the pose (4, 4) in {O} of the frame of a row; see `posture`."""
-        if self.frame == "object":
-            return np.eye(4)
-        if self.frame == "mesh":
-            if X_OM is None:
-                raise GraspError("X_OM must be given for the frame mesh, got None")
-            return X_OM
-        X_OT = invert_pose(X_TO)
-        if self.frame == "table":
-            return X_OT
-        return multiply(X_OT, invert_pose(X_WT) if self.X_TC is None else self.X_TC[i])
+        return frame_in_object(self.frame, X_TO, X_OM, None if self.X_TC is None else self.X_TC[i])
 
     def names_pose(self, i: int) -> bool:
         """Return whether a row names its resting pose."""
@@ -189,7 +199,7 @@ class Attempts:
     def nameless(self) -> str:
         """A message on the rows that name no resting pose; empty if there are none."""
         rows = [i for i in range(len(self)) if not (self.invalid[i] or self.names_pose(i))]
-        if not rows or self.grasps is not None:
+        if not rows:
             return ""
         return (
             f"{len(rows):,} of {len(self):,} rows of the postures name no resting pose: each is "
@@ -199,8 +209,6 @@ class Attempts:
     @property
     def bare(self) -> str:
         """A message on the rows that are palm poses alone; empty if there are none."""
-        if self.grasps is not None:
-            return ""
         without = np.isnan(self.q_grasp).all(axis=1)
         rows = [i for i in np.flatnonzero(without) if not self.invalid[i]]
         if not rows:
@@ -209,13 +217,6 @@ class Attempts:
             f"{len(rows):,} of {len(self):,} rows of the postures have a palm pose and no joints: "
             "the open hand closes"
         )
-
-    @property
-    def left_out(self) -> str:
-        """A message on the objects of which the split has no row; empty if there are none."""
-        if not self.without_rows:
-            return ""
-        return f"grasps are left out, as the split has no row of {listed(self.without_rows)}"
 
     def shapes(self, i: int, hand: Hand) -> tuple[str, ...]:
         """Return the preshapes in which a row is tried: the one that it names, or each preshape."""
@@ -236,16 +237,9 @@ class Attempts:
 
     def numbers(self) -> Array:
         """Return all numbers (n, m) that describe the rows; NaN for numbers that a row lacks."""
-        if self.grasps is not None:
-            return self.grasps
         X = [X for X in (self.X_FG, self.X_TC) if X is not None]
         q = [self.q_grasp, self.q_pregrasp, self.q_squeeze]
         return np.column_stack([*(each.reshape(len(self), 16) for each in X), *q])
-
-    def refuse(self, reasons: Sequence[str]) -> Attempts:
-        """Return the table with additional reasons (n,) why rows are not valid."""
-        both = (one or other for one, other in zip(self.invalid, reasons, strict=True))
-        return replace(self, invalid=tuple(both))
 
     @property
     def refused(self) -> str:
@@ -278,14 +272,38 @@ class Attempts:
         return digest.hexdigest()[:16]
 
 
-def ranked(table: Attempts, of: Sequence[Any] | npt.NDArray[Any]) -> Attempts:
+def frame_in_object(frame: str, X_TO: Array, X_OM: Array | None, X_TC: Array | None) -> Array:
+    """Return the pose X_OA (4, 4) of a frame in {O}.
+
+    Args:
+        frame: One of `TABLE_FRAMES`.
+        X_TO: Pose (4, 4) of the object on the table.
+        X_OM: Pose (4, 4) of the mesh file's frame in {O}, for the frame "mesh".
+        X_TC: Pose (4, 4) of the camera in {T}, for the frame "camera".
+
+    Raises:
+        GraspError: If the frame is "mesh" and its pose is not given.
+    """
+    if frame == "object":
+        return np.eye(4)
+    if frame == "mesh":
+        if X_OM is None:
+            raise GraspError("X_OM must be given for the frame mesh, got None")
+        return X_OM
+    X_OT = invert_pose(X_TO)
+    if frame == "table":
+        return X_OT
+    return multiply(X_OT, invert_pose(X_WT) if X_TC is None else X_TC)
+
+
+def ranked(table: Rows, of: Sequence[Any] | npt.NDArray[Any]) -> Rows:
     """Return a table with the rank of each row among the rows with the same target.
 
     The row with the greatest confidence is first; of equal ones, the row that was given first.
     Invalid rows without a confidence are last.
 
     Args:
-        table: The attempts.
+        table: The grasps.
         of: (n,), target of each row, e.g. a row of a dataset.
     """
     _, number, counts = np.unique(np.asarray(of), return_inverse=True, return_counts=True)
@@ -483,9 +501,14 @@ def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
     # The numbers of a bad row do not matter, because nothing reads them.
     nothing = replace(tables[0].at([0]), objects=("",), said=("",))
     whole = [p if isinstance(p, Attempts) else replace(nothing, invalid=(p,)) for p in parts]
+    return join_rows(whole)
+
+
+def join_rows(tables: Sequence[Rows]) -> Rows:
+    """Return the concatenated rows of some tables of one kind; the first states the rest."""
     joined: dict[str, Any] = {}
     for name, value in tables[0]:
-        values = [getattr(part, name) for part in whole]
+        values = [getattr(part, name) for part in tables]
         if any(each is None for each in values):
             joined[name] = None
         elif isinstance(value, tuple):

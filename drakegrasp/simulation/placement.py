@@ -20,7 +20,7 @@ import trimesh
 from drakegrasp.config import Config
 from drakegrasp.errors import ConfigError, GraspError, MeshError
 from drakegrasp.frames import Array, make_pose, read_pose, transform_points
-from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.mesh.loading import clean_triangles
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import UNITS, find_mesh, refuse_units
@@ -75,26 +75,31 @@ def place_object(
     *,
     units: str | None = None,
     X_TO: npt.ArrayLike | None = None,
+    hand: str | Path | None = None,
     config: Config | None = None,
 ) -> PlacedObject:
-    """Return an object on the table.
+    """Return an object on the table, prepared once for any number of grasps.
 
     Args:
         mesh: Path of a mesh file, a mesh, or a placed object. The origin of {O} is the centre of
             the bounding box, not the origin of the file.
         units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` in
-            the folder of the mesh overrides it.
-        X_TO: Pose of the object on the table; if None, the object is dropped as in a build.
-        config: Mass, friction and settling; if None, the configuration of a placed object, or else
-            the defaults.
+            the folder of the mesh overrides it. Grasps are always in metres.
+        X_TO: Pose of the object on the table, (4, 4); if None, the object is dropped as in a build.
+        hand: Name or YAML file of the hand; None for the configuration's ("barrett").
+        config: Hand, physics, lift and rules; if None, the configuration of a placed object, or
+            else the defaults.
 
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
         GraspError: If X_TO is not a pose or does not put the object on the table.
         ConfigError: If config is not a `Config`, or the object was placed with other values.
+        HandError: If the hand cannot be used.
     """
     # Check the arguments that do not depend on the kind of mesh.
     config = config_for(mesh, config)
+    if hand is not None:
+        config = override_config(config, [], hand=str(hand))
     refuse_units(units or "m")
 
     # Prepare the object, unless it is already prepared.

@@ -337,15 +337,23 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
 
 
 def force_margin(
-    model: ObjectModel, X_TO: npt.ArrayLike, contacts: GraspContacts, config: Config
+    model: ObjectModel,
+    X_TO: npt.ArrayLike,
+    p_OQ: npt.ArrayLike,
+    nhat_Q_O: npt.ArrayLike,
+    config: Config,
 ) -> tuple[float, float]:
     """Return the margin by which forces at the contacts of a grasp hold the object in its lift.
+
+    The contacts are those on the surface that a prediction selects, modelled as points, or as
+    patches for a hand with two fingertips.
 
     Args:
         model: The object.
         X_TO: (4, 4), resting pose of the object.
-        contacts: Contacts of the grasp.
-        config: Friction and lift.
+        p_OQ: (k, 3), predicted points in {O} [m].
+        nhat_Q_O: (k, 3), predicted unit normals out of the object in {O}.
+        config: The hand, its drive, friction and lift.
 
     Returns:
         Two numbers. The first is the epsilon of Ferrari and Canny at the configured friction, with
@@ -353,6 +361,8 @@ def force_margin(
         is 0 without force closure. The second is the smallest coefficient at which forces within
         the limits of the hand's fingertips support the lift; it is inf if no coefficient suffices.
     """
+    found = surface_contacts(model, p_OQ, nhat_Q_O)
+    contacts = _grasp(model, found, config, patches=len(found.p_OQ) < ENOUGH_POINTS)
     epsilon = ferrari_canny(
         contacts,
         friction=model.own_physics(config.physics).friction_hand,
@@ -626,23 +636,6 @@ def judge_forces(
             ForceProgram(_grasp(model, contacts, config, patches=True), friction), wrenches
         ),
     )
-
-
-def hand_contacts(
-    model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.ArrayLike, config: Config
-) -> GraspContacts:
-    """Return the contacts on the surface that a prediction selects for the configuration's hand.
-
-    Contacts are modelled as points, or as patches for a hand with two fingertips.
-
-    Args:
-        model: The object.
-        p_OQ: (k, 3), predicted points in {O} [m].
-        nhat_Q_O: (k, 3), predicted unit normals out of the object in {O}.
-        config: The hand and its drive.
-    """
-    contacts = surface_contacts(model, p_OQ, nhat_Q_O)
-    return _grasp(model, contacts, config, patches=len(contacts.p_OQ) < ENOUGH_POINTS)
 
 
 def _grasp(model: ObjectModel, contacts: Table, config: Config, *, patches: bool) -> GraspContacts:

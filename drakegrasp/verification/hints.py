@@ -1,17 +1,16 @@
 """Possible faults in the numbers of a grasp that fails; hints do not change a verdict.
 
-Input: a placed grasp. Output: how its contacts lie on the surface, and hints in words. A hint
-states that the same numbers would fit much better if they were read in a different way: in a
-different frame or unit, with reversed normals, or with the fingers in a different order. All
-factors are own choices.
+Input: a placed grasp. Output: how its contacts lie on the surface, and readings of the same numbers
+that would fit much better: in a different frame or unit, with reversed normals, or with the fingers
+in a different order. All factors are own choices.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from itertools import permutations
-from typing import TypeAlias
 
 import numpy as np
 
@@ -88,126 +87,136 @@ MOST_ORDERS = 5
 #: Units that lengths may have been meant in, by their factors to metres.
 _UNITS = {
     1.0: "",
-    1e-3: "points in millimetres instead of metres",
-    1e-2: "points in centimetres instead of metres",
-    1e2: "points 100 times as large",
-    1e3: "points 1000 times as large",
+    1e-3: "{points} in millimetres instead of metres",
+    1e-2: "{points} in centimetres instead of metres",
+    1e2: "{points} 100 times as large",
+    1e3: "{points} 1000 times as large",
 }
-#: The hint about normals.
-REVERSED = "normals that point the other way, out of the object"
-
-#: A possible reading of the numbers: frame and unit in words, empty for the given ones, and the
-#: resulting points (k, 3) [m] and unit normals (k, 3), or None, in {O}.
-Reading: TypeAlias = tuple[str, str, Array, Array | None]
 
 
-def _frames(grasp: PlacedGrasp, thing: PlacedObject) -> dict[str, Array]:
-    """Return the poses X_OF (4, 4) of possible frames of the numbers; the given frame is first."""
-    X_OT, given = invert_pose(thing.X_TO), grasp.attempt.X_TC
-    frames = {
-        "": grasp.X_OA(thing),
-        "the object's frame (object)": np.eye(4),
-        "the table's frame (table)": X_OT,
-        "the world's frame": multiply(X_OT, invert_pose(X_WT)),
-        "the mesh file's frame (mesh)": thing.model.X_OM,
-    }
-    frames |= {name: multiply(X_OT, X_TC) for name, X_TC in grasp.cameras.items()}
-    if given is not None and not grasp.cameras:
-        # A caller who gives the pose of a camera may mean another pose.
-        X_CT = invert_pose(given[0])
-        frames |= {
-            "the inverse of X_TC": multiply(X_OT, X_CT),
-            "the inverse of X_TC, which is the object's pose in the camera's frame": X_CT,
-            "X_TC as the camera's pose in the object's frame": given[0],
-        }
-    return frames
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """A way to read the numbers of a grasp, in which it would fit much better.
+
+    Attributes:
+        frame: Frame of the numbers, or what a pose means, in words; empty for the given one.
+        factor: Factor of lengths to metres.
+        palm: Whether the lengths are positions of the palm, and not points.
+        reversed: Whether the normals point the other way.
+        order: Indices of the fingers; empty for the given order.
+    """
+
+    frame: str = ""
+    factor: float = 1.0
+    palm: bool = False
+    reversed: bool = False
+    order: tuple[int, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The reading in words, a part of a sentence."""
+        points = "positions of the palm" if self.palm else "points"
+        facts = [self.frame, _UNITS[self.factor].format(points=points)]
+        if self.reversed:
+            facts.append("normals that point the other way, out of the object")
+        if self.order:
+            fingers = " ".join(str(i + 1) for i in self.order)
+            facts.append(f"contacts in the order {fingers} of the fingers")
+        return ", with ".join(filter(None, facts))
 
 
-def find_hints(
-    grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array, *, fits: bool = False
-) -> tuple[str, ...]:
-    """Return hints on readings in which the contacts would fit much better.
+def contact_readings(grasp: PlacedGrasp, nhat_Q_O: Array, *, fits: bool) -> tuple[Reading, ...]:
+    """Return readings in which the contacts of a grasp would fit much better.
 
     Args:
         grasp: The grasp on its object.
-        p_OQ: (k, 3), contact points in {O} [m].
-        nhat_Q_O: (k, 3), unit normals in {O}.
+        nhat_Q_O: (k, 3), its rounded normals in {O}.
         fits: Whether the hand makes the contacts; then only their place may be wrong.
     """
-    thing, hand = grasp.placed, load_hand(grasp.config.hand_source)
-    fit = fit_surface(thing.model, p_OQ, nhat_Q_O)
-    X_AO = invert_pose(grasp.X_OA(thing))
+    placed, (p_OQ, _) = grasp.placed, grasp.in_object_frame()
+    surface = fit_surface(placed.model, p_OQ, nhat_Q_O)
+    X_AO = invert_pose(grasp.X_OA(placed))
     p_AQ, nhat_Q_A = transform_points(X_AO, p_OQ), rotate_vectors(X_AO, nhat_Q_O)
 
     # If the points are elsewhere, neither normals nor fingers are informative.
-    if fit.distance.max() > FAR:
-        readings: list[Reading] = [
-            (name, unit, transform_points(X_OF, factor * p_AQ), rotate_vectors(X_OF, nhat_Q_A))
-            for name, X_OF in _frames(grasp, thing).items()
-            for factor, unit in _UNITS.items()
-        ]
-        if place := _better_place(thing.model, fit, readings):
-            return (place,)
+    if surface.distance.max() > FAR:
+        better = _better_place(
+            placed.model,
+            surface,
+            _frames(grasp, placed),
+            lambda X_OF, factor: (
+                transform_points(X_OF, factor * p_AQ),
+                rotate_vectors(X_OF, nhat_Q_A),
+            ),
+        )
+        if better:
+            return (better,)
     if fits:
         return ()
-    return (*_turned(thing.model, fit, p_OQ, nhat_Q_O), *_reordered(hand, thing, p_OQ, nhat_Q_O))
+    turned = _points_inwards(placed.model, surface, p_OQ, nhat_Q_O)
+    order = _better_order(load_hand(grasp.config.hand_source), placed, p_OQ, nhat_Q_O)
+    return (
+        *([Reading(reversed=True)] if turned else []),
+        *([Reading(order=order)] if order else []),
+    )
 
 
-def find_posture_hints(
-    grasp: PlacedGrasp, thing: PlacedObject, posture: Posture
-) -> tuple[tuple[str, ...], Array]:
-    """Return hints on readings that bring the fingertips of a posture much closer to the object.
+def posture_readings(
+    grasp: PlacedGrasp, placed: PlacedObject, posture: Posture
+) -> tuple[tuple[Reading, ...], Array]:
+    """Return readings that bring the fingertips of a posture much closer to the object.
 
     Args:
         grasp: The grasp of the posture.
-        thing: The object in its resting pose.
+        placed: The object in its resting pose.
         posture: Wrist and joints, in {O} of this object.
 
     Returns:
-        The hints, and the distances (m,) from the surface of the fingertips that the posture closes
-        [m]. There are none for a palm pose alone, or if the hand's fingertips have no nominal
-        contact points.
+        The readings, and the distances (m,) from the surface of the fingertips that the posture
+        closes [m]. There are none for a palm pose alone, or if the hand's fingertips have no
+        nominal contact points.
     """
     hand = load_hand(grasp.config.hand_source)
     try:
-        p_GQ = _fingertips(hand, posture)
+        p_GQ = fingertips(hand, posture)
     except HandError:
         return (), np.zeros(0)
-
-    def fingertips(X_OG: Array) -> tuple[Array, None]:
-        return transform_points(X_OG, p_GQ), None
-
-    p_OQ, _ = fingertips(posture.X_OG)
-    fit = fit_surface(thing.model, p_OQ, np.zeros_like(p_OQ))
+    p_OQ = transform_points(posture.X_OG, p_GQ)
+    surface = fit_surface(placed.model, p_OQ, np.zeros_like(p_OQ))
     # The final positions of the fingers of a palm pose alone are unknown.
-    distance = np.zeros(0) if posture.q_grasp is None else fit.distance
-    if fit.distance.mean() <= FAR:
+    distance = np.zeros(0) if posture.q_grasp is None else surface.distance
+    if surface.distance.mean() <= FAR:
         return (), distance
 
-    # The position of the given pose: lengths in another unit move the palm with it.
-    X_AG, X_OA, attempt = grasp.attempt.X_FG[0], grasp.X_OA(thing), grasp.attempt
-    X_AL = multiply(X_AG, invert_pose(hand.palm_in(attempt.link))) if attempt.link else X_AG
-    p_AL = X_AL[:3, 3]
+    # Other meanings of the pose in the given frame.
+    X_AG, X_OA = grasp.X_AG, grasp.X_OA(placed)
+    assert X_AG is not None
+    X_AL = multiply(X_AG, invert_pose(hand.palm_in(grasp.link))) if grasp.link else X_AG
     meant = dict[str, Array]()
-    if attempt.X_FG_xyzw is not None and np.isfinite(attempt.X_FG_xyzw).all():
-        meant["quaternions x, y, z, w instead of w, x, y, z"] = attempt.X_FG_xyzw[0]
-    if not attempt.link:
+    if grasp.X_AG_xyzw is not None:
+        meant["quaternions x, y, z, w instead of w, x, y, z"] = grasp.X_AG_xyzw
+    if not grasp.link:
         at_link = f"poses of the palm link instead of the palm (link: {hand.palm_link})"
         meant[at_link] = multiply(X_AG, hand.X_BG)
     for name in hand.frames:
-        if name != attempt.link:
+        if name != grasp.link:
             at_tool = f"poses in the frame of {name} (link: {name})"
             meant[at_tool] = multiply(X_AL, hand.palm_in(name))
-    readings: list[Reading] = [
-        (text, "", *fingertips(multiply(X_OA, X))) for text, X in meant.items()
-    ]
-    for name, X_OF in _frames(grasp, thing).items():
-        for factor, unit in _UNITS.items():
-            X = X_AG.copy()
-            X[:3, 3] += (factor - 1.0) * p_AL
-            readings.append((name, unit, *fingertips(multiply(X_OF, X))))
-    place = _better_place(thing.model, fit, readings).replace("points", "positions of the palm")
-    return (place,) if place else (), distance
+
+    # The position of the given pose: lengths in another unit move the palm with it.
+    def at(X_OF: Array, factor: float) -> tuple[Array, None]:
+        X_FG = X_AG.copy()
+        X_FG[:3, 3] += (factor - 1.0) * X_AL[:3, 3]
+        return transform_points(multiply(X_OF, X_FG), p_GQ), None
+
+    better = _better_place(
+        placed.model,
+        surface,
+        _frames(grasp, placed),
+        at,
+        others={n: transform_points(multiply(X_OA, X), p_GQ) for n, X in meant.items()},
+    )
+    return ((better,) if better else ()), distance
 
 
 def count_hints(hints: Iterable[tuple[str, ...]]) -> list[tuple[str, int]]:
@@ -215,26 +224,71 @@ def count_hints(hints: Iterable[tuple[str, ...]]) -> list[tuple[str, int]]:
     return Counter(hint for each in hints for hint in each).most_common()
 
 
-def _better_place(model: ObjectModel, fit: Table, readings: Iterable[Reading]) -> str:
-    """Return the frame and unit in which far points are near the surface; empty if there is none.
+def _frames(grasp: PlacedGrasp, placed: PlacedObject) -> dict[str, Array]:
+    """Return the poses X_OF (4, 4) of possible frames of the numbers; the given frame is first."""
+    X_OT = invert_pose(placed.X_TO)
+    frames = {
+        "": grasp.X_OA(placed),
+        "the object's frame (object)": np.eye(4),
+        "the table's frame (table)": X_OT,
+        "the world's frame": multiply(X_OT, invert_pose(X_WT)),
+        "the mesh file's frame (mesh)": placed.model.X_OM,
+    }
+    frames |= {name: multiply(X_OT, X_TC) for name, X_TC in grasp.cameras.items()}
+    if grasp.X_TC is not None and not grasp.cameras:
+        # A caller who gives the pose of a camera may mean another pose.
+        X_CT = invert_pose(grasp.X_TC)
+        frames |= {
+            "the inverse of X_TC": multiply(X_OT, X_CT),
+            "the inverse of X_TC, which is the object's pose in the camera's frame": X_CT,
+            "X_TC as the camera's pose in the object's frame": grasp.X_TC,
+        }
+    return frames
+
+
+def _better_place(
+    model: ObjectModel,
+    given: Table,
+    frames: Mapping[str, Array],
+    read: Callable[[Array, float], tuple[Array, Array | None]],
+    others: Mapping[str, Array] | None = None,
+) -> Reading | None:
+    """Return the frame and unit in which far points are near the surface; None if there is none.
 
     Of several readings, one that changes only frame or unit wins, then the closest one.
+
+    Args:
+        model: The object.
+        given: How the given points lie on the surface, see `fit_surface`.
+        frames: Poses X_OF (4, 4) of possible frames, by their names.
+        read: Returns points (k, 3) [m] and normals (k, 3) in {O}, or no normals, for the pose of a
+            frame and the factor of a unit.
+        others: For postures: points (k, 3) [m] in {O} by other meanings of the palm's pose.
     """
-    limit, found = min(MUCH_NEARER * fit.distance.mean(), FAR), list[tuple[bool, float, str]]()
-    for frame, unit, points, normals in readings:
+    limit, palm = min(MUCH_NEARER * given.distance.mean(), FAR), others is not None
+    found = list[tuple[bool, float, Reading]]()
+    readings: list[tuple[Reading, Array, Array | None]] = [
+        (Reading(frame=name, palm=palm), points, None) for name, points in (others or {}).items()
+    ]
+    readings += [
+        (Reading(frame=name, factor=factor, palm=palm), *read(X_OF, factor))
+        for name, X_OF in frames.items()
+        for factor in _UNITS
+    ]
+    for reading, points, normals in readings:
+        frame, other_unit = reading.frame, reading.factor != 1.0
         shrunk = normals is not None and np.ptp(points, axis=0).max() < LEAST_SPREAD
-        if shrunk or not (frame or unit):
+        if shrunk or not (frame or other_unit):
             continue
         there = fit_surface(model, points, np.zeros_like(points) if normals is None else normals)
         # Another unit does not turn normals, so they are not informative for it.
         agrees = normals is None or not frame or there.agreement.mean() > AGREEMENT
         if there.distance.mean() <= limit and agrees:
-            text = ", with ".join(filter(None, (frame, unit)))
-            found.append((bool(frame and unit), float(there.distance.max()), text))
-    return min(found, key=lambda each: each[:2])[2] if found else ""
+            found.append((bool(frame and other_unit), float(there.distance.max()), reading))
+    return min(found, key=lambda each: each[:2])[2] if found else None
 
 
-def _fingertips(hand: Hand, posture: Posture) -> Array:
+def fingertips(hand: Hand, posture: Posture) -> Array:
     """Return the nominal contact points p_GQ (m, 3) of the fingers that a posture closes.
 
     A palm pose alone closes the hand until something stops it; here it is treated as half closed.
@@ -255,24 +309,25 @@ def _fingertips(hand: Hand, posture: Posture) -> Array:
     return np.asarray((points + X_GF[:, :3, 3])[~unused])
 
 
-def _turned(model: ObjectModel, fit: Table, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
-    """Yield the hint that the normals point inwards, if they do."""
-    given, other = fit.agreement.mean(), fit_surface(model, p_OQ, -nhat_Q_O).agreement.mean()
+def _points_inwards(model: ObjectModel, surface: Table, p_OQ: Array, nhat_Q_O: Array) -> bool:
+    """Return whether the normals point into the object."""
+    given, other = surface.agreement.mean(), fit_surface(model, p_OQ, -nhat_Q_O).agreement.mean()
     # Next to a thin wall both sides are near; then only points on the surface are informative.
-    if fit.distance.max() < ON_SURFACE:
-        given = np.sum(nhat_Q_O * fit.normals, axis=1).mean()
+    if surface.distance.max() < ON_SURFACE:
+        given = np.sum(nhat_Q_O * surface.normals, axis=1).mean()
         other = -given
-    if given < 0.0 and other > AGREEMENT:
-        yield REVERSED
+    return bool(given < 0.0 and other > AGREEMENT)
 
 
-def _reordered(hand: Hand, thing: PlacedObject, p_OQ: Array, nhat_Q_O: Array) -> Iterator[str]:
-    """Yield the order of the fingers in which the hand reaches the contacts best, if much better.
+def _better_order(
+    hand: Hand, placed: PlacedObject, p_OQ: Array, nhat_Q_O: Array
+) -> tuple[int, ...] | None:
+    """Return the order of the fingers in which the hand reaches the contacts much better.
 
     The table of postures is coarse and permits palms below the table, where the mirror image of an
     order fits as well. So it only chooses the orders that the wrist problem is solved for.
     """
-    postures, X_TO = make_postures(hand), thing.X_TO_simulated
+    postures, X_TO = make_postures(hand), placed.X_TO_simulated
     given, *others = permutations(range(hand.num_fingers))  # 6 for three fingers, 120 for five
     likely = sorted(
         others, key=lambda order: posture_misfit(postures, p_OQ[[*order]], nhat_Q_O[[*order]])
@@ -284,5 +339,4 @@ def _reordered(hand: Hand, thing: PlacedObject, p_OQ: Array, nhat_Q_O: Array) ->
         for order in (given, *likely[:MOST_ORDERS])
     }
     best = min(reach, key=lambda order: reach[order])
-    if reach[best] < MUCH_LIKER * reach[given]:
-        yield f"contacts in the order {' '.join(str(i + 1) for i in best)} of the fingers"
+    return best if reach[best] < MUCH_LIKER * reach[given] else None

@@ -1,4 +1,4 @@
-"""The requests of a caller: each attempt in {O} of its object on the table.
+"""The requests of a caller: each grasp in {O} of its object on the table.
 
 Input: contacts or postures, with an object, with the objects of a dataset, or with rows of a
 dataset. Output: a `PlacedGrasp` for each. Every mistake of the caller is found here, before
@@ -10,17 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import Config
+from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS
-from drakegrasp.errors import GraspError, HandError
+from drakegrasp.errors import GraspError, HandError, listed
 from drakegrasp.frames import (
     Array,
     as_numbers,
@@ -36,9 +36,10 @@ from drakegrasp.simulation.attempts import (
     CONDITIONS,
     UNTOLD,
     Attempts,
+    GraspRows,
+    frame_in_object,
     misfits,
     read_confidence,
-    unknown_objects,
 )
 from drakegrasp.simulation.placement import (
     PlacedObject,
@@ -49,7 +50,7 @@ from drakegrasp.simulation.placement import (
 )
 from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.settle import find_resting_poses
-from drakegrasp.verification.prediction import in_frame, read_grasps
+from drakegrasp.verification.prediction import FRAMES, ContactRows, read_grasps
 
 #: The row of a split for each of n grasps, or one row for all; None for all rows, in order.
 RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
@@ -63,59 +64,75 @@ METHODS = ("hand", "forces")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacedGrasp:
-    """An attempt on an object on the table, with everything that its verification needs.
+    """A grasp on an object on the table, with everything that its verification needs.
 
     Attributes:
         index: Index among the caller's grasps.
-        attempt: The grasp's row of a table: contacts, a posture, or the reason why it is invalid.
         stands: The object in its resting pose; in each of its resting poses for a posture that
             names none.
         method: "hand" or "forces" for contacts, "posture" for postures.
-        config: Hand, physics, lift and rules. The setting that ends lifts (`lift.stop_when`) has no
-            effect, because the verdict is that of a whole lift.
-        snap_points: Whether to move contact points to the surface.
+        config: Hand, physics, lift and rules. Lifts are whole (`lift.stop_when` is never), because
+            the verdict is that of a whole lift.
+        invalid: Reason why the grasp is invalid; empty if it is valid.
+        frame: Frame {A} of the grasp's numbers.
+        X_TC: Pose (4, 4) of the camera, for the frame "camera".
         cameras: Poses X_TC (4, 4) of cameras in whose frames the grasp could be, by the names of
             these frames.
+        confidence: Confidence that the caller states; NaN if none is stated.
+        rank: Rank by confidence among the grasps for the same row, or of the same object; 0 for the
+            best, -1 without confidence.
+        p_AQ, nhat_Q_A: (k, 3), contact points [m] and outward unit normals in {A}; NaN for a
+            posture and for an invalid row.
+        normalised: Whether a normal was not of unit length.
+        snap_points: Whether to move contact points to the surface.
+        postures: Wrist and joints in {O} for each of the stands; none for contacts and for an
+            invalid row.
+        preshapes: The preshapes in which a posture is tried; the name is empty if all fingers
+            close.
+        named: Whether a posture names its resting pose.
+        X_AG: Pose (4, 4) of the palm of a posture in {A}; None for contacts.
+        link: See `Attempts.link`.
+        X_AG_xyzw: X_AG read with its quaternion in the order x, y, z, w; None if it has none.
     """
 
     index: int
-    attempt: Attempts
     stands: tuple[PlacedObject, ...]
     method: str
     config: Config
-    snap_points: bool = False
+    invalid: str = ""
+    frame: str = "object"
+    X_TC: Array | None = None
     cameras: Mapping[str, Array] = field(default_factory=dict)
+    confidence: float = np.nan
+    rank: int = -1
+    p_AQ: Array
+    nhat_Q_A: Array
+    normalised: bool = False
+    snap_points: bool = False
+    postures: tuple[Posture, ...] = ()
+    preshapes: tuple[str, ...] = ("",)
+    named: bool = True
+    X_AG: Array | None = None
+    link: str = ""
+    X_AG_xyzw: Array | None = None
 
     @property
     def placed(self) -> PlacedObject:
         """The object on the table, in the first of the resting poses."""
         return self.stands[0]
 
-    @property
-    def invalid(self) -> str:
-        """Reason why the grasp is invalid; empty if it is valid."""
-        return self.attempt.invalid[0]
-
-    def X_OA(self, thing: PlacedObject) -> Array:
+    def X_OA(self, placed: PlacedObject) -> Array:
         """Return the pose (4, 4) of the frame of the grasp's numbers in {O} of a resting object."""
-        return self.attempt.frame_pose(0, thing.X_TO, thing.model.X_OM)
+        return frame_in_object(self.frame, placed.X_TO, placed.model.X_OM, self.X_TC)
 
-    def posture(self, thing: PlacedObject) -> Posture:
-        """Return wrist and joints of a posture, in {O} of a resting object."""
-        return self.attempt.posture(0, thing.X_TO, thing.model.X_OM)
-
-    def contacts(self) -> tuple[Array, Array]:
+    def in_object_frame(self) -> tuple[Array, Array]:
         """Return points p_OQ [m] and unit normals nhat_Q_O (k, 3) in {O}; NaN without contacts."""
-        points, normals = self.attempt.points, self.attempt.normals
-        if points is None or normals is None:
-            nothing = np.full((load_hand(self.config.hand_source).num_fingers, 3), np.nan)
-            return nothing, nothing
         X_OA = self.X_OA(self.placed)
-        return transform_points(X_OA, points[0]), rotate_vectors(X_OA, normals[0])
+        return transform_points(X_OA, self.p_AQ), rotate_vectors(X_OA, self.nhat_Q_A)
 
 
 def place_on_object(
-    grasps: npt.ArrayLike | Attempts,
+    grasps: npt.ArrayLike | GraspRows,
     placed: PlacedObject,
     *,
     frame: str = "object",
@@ -133,56 +150,302 @@ def place_on_object(
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
     """
-    table, things, config = _read(grasps, method, placed.config), [placed], placed.config
-    if table.points is not None:
-        table = in_frame(table, frame, None if X_TC is None else read_pose(X_TC, "X_TC"))
-    elif config.objects.resting_poses > 1:
-        others = find_resting_poses(placed.model, config)[1:]
-        things += [replace(placed, X_TO=resting.X_TO) for resting in others]
-    table = replace(table, objects=(placed.model.name,) * len(table))
-    how: dict[str, Any] = {"method": method, "snap_points": snap_points, "overrides": overrides}
-    return _placed(table, range(len(table)), things, config, **how)
+    stands, config = [placed], placed.config
+    table = _read(grasps, method, config)
+    if isinstance(table, ContactRows):
+        poses = _camera_poses(frame, X_TC, len(table))
+        request = _Request(table=table, method=method, snap_points=snap_points, frame=frame,
+                           X_TC=poses)  # fmt: skip
+    else:
+        request = _Request.of_postures(
+            replace(table, objects=(placed.model.name,) * len(table)), overrides
+        )
+        if config.objects.resting_poses > 1:
+            others = find_resting_poses(placed.model, config)[1:]
+            stands += [replace(placed, X_TO=resting.X_TO) for resting in others]
+    return request.place(range(len(table)), stands, config)
 
 
 def place_on_rows(
-    grasps: npt.ArrayLike | Attempts,
+    grasps: npt.ArrayLike | GraspRows,
     dataset: GraspDataset,
     rows: RowChoice = None,
     *,
+    config: Config,
+    drawn: bool = True,
     frame: str = "camera",
-    hand: str | Path | None = None,
     method: str = "hand",
     snap_points: bool = False,
-    config: Config | None = None,
-    overrides: tuple[str, ...] = (),
+    overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
     """Return grasps in {O} of the objects of a dataset's rows.
 
     Grasps of the same object are adjacent, so that its scene is built once. Arguments and errors
-    are those of `drakegrasp.verify_grasps` and of `dataset_config`. One row may be given for all
-    grasps. Without a configuration, each grasp has the friction and mass that were drawn for its
-    row, except for overridden values. Postures are tried on the object and in the resting pose of
-    their rows, whatever they state themselves.
+    are those of `drakegrasp.verify_grasps`; the configuration is of `dataset_config`. One row may
+    be given for all grasps. With `drawn`, each grasp has the friction and mass that were drawn for
+    its row, except for overridden values. Postures are tried on the object and in the resting pose
+    of their rows, whatever they state themselves.
     """
     # Read all grasps before any object, so that a wrong number is reported at once.
-    used = dataset_config(dataset, config, hand, overrides)
-    table = _read(grasps, method, used)
-    count = len(table)
-    chosen = choose_rows(dataset, table.of_row if rows is None else rows, count)
+    table = _read(grasps, method, config)
+    chosen = choose_rows(dataset, table.of_row if rows is None else rows, len(table))
     cameras = cameras_of_rows(dataset, chosen)
-    if table.points is not None:
-        table = in_frame(table, frame, cameras[CAMERA] if frame == "camera" else None)
 
     # Object, resting pose and drawn conditions are those of the rows.
-    table = replace(
-        table,
-        objects=tuple(dataset.column("object_props/object_name")[chosen].tolist()),
-        resting=dataset.column("grasp_props/resting")[chosen].astype(np.int64),
-        X_TO=np.full((count, 4, 4), np.nan),
-        conditions=_drawn(dataset, chosen) if config is None else np.full((count, 3), np.nan),
+    objects = tuple(dataset.column("object_props/object_name")[chosen].tolist())
+    resting = dataset.column("grasp_props/resting")[chosen].astype(np.int64)
+    known = _drawn(dataset, chosen) if drawn else np.full((len(table), 3), np.nan)
+    if isinstance(table, ContactRows):
+        X_TC = _camera_poses(frame, cameras[CAMERA] if frame == "camera" else None, len(table))
+        request = _Request(table=table, method=method, snap_points=snap_points, frame=frame,
+                           X_TC=X_TC, resting=resting, conditions=known,
+                           overrides=overrides)  # fmt: skip
+    else:
+        nowhere = np.full((len(table), 4, 4), np.nan)
+        table = replace(table, objects=objects, resting=resting, X_TO=nowhere, conditions=known)
+        request = _Request.of_postures(table, overrides)
+    request = replace(request, cameras={**cameras, **request.cameras})
+    return request.place_on_objects(objects, dataset.path.parent, config)
+
+
+def place_on_dataset(
+    table: Attempts, out: Path, config: Config | None = None, *, overrides: Sequence[str] = ()
+) -> list[PlacedGrasp]:
+    """Return postures on the objects of a dataset that they name.
+
+    Rows of an object in a resting pose are adjacent, so that its scene is built once.
+
+    Args:
+        table: The postures.
+        out: Directory of the dataset.
+        config: Configuration for the trials; None for each object's configuration.
+        overrides: Settings of the caller; they take precedence over the conditions of a row.
+
+    Raises:
+        GraspError: If the postures are in the frames of mesh files.
+        DataError: If the dataset cannot be used.
+    """
+    return _Request.of_postures(table, overrides).place_on_objects(table.objects, out, config)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Request:
+    """n grasps of a caller, and where they are; columns as in `Attempts`, None if not stated."""
+
+    table: ContactRows | Attempts
+    method: str
+    snap_points: bool = False
+    overrides: Sequence[str] = ()
+    frame: str
+    X_TC: Array | None = None
+    cameras: Mapping[str, Array] = field(default_factory=dict)
+    resting: npt.NDArray[np.int64] | None = None
+    X_TO: Array | None = None
+    conditions: Array | None = None
+
+    @classmethod
+    def of_postures(cls, table: Attempts, overrides: Sequence[str]) -> _Request:
+        """Return the request of postures, which state themselves where they are."""
+        return cls(
+            table=table,
+            method="posture",
+            overrides=overrides,
+            frame=table.frame,
+            X_TC=table.X_TC,
+            cameras={} if table.X_TC is None else {CAMERA: table.X_TC},
+            resting=table.resting,
+            X_TO=table.X_TO,
+            conditions=table.conditions,
+        )
+
+    def place_on_objects(
+        self, objects: Sequence[str], out: Path, config: Config | None
+    ) -> list[PlacedGrasp]:
+        """Return the rows on the objects (n,) of a dataset, object by object."""
+        if self.frame == "mesh" and isinstance(self.table, Attempts):
+            # Meshes of a dataset are exported in {O}: a file cannot say which of both meshes it
+            # means.
+            raise GraspError(
+                "frame must not be mesh for postures on a dataset, got mesh: for its exported "
+                "meshes use --frame object, or give the mesh itself (drakegrasp verify FILE "
+                "--object MESH)"
+            )
+        manifest, placed = read_manifest(out), list[PlacedGrasp]()
+        names = [entry.name for entry in manifest.objects]
+        for name in dict.fromkeys(objects):
+            # An object that does not exist is known by its name alone.
+            there = name if name in names else names[0]
+            own = manifest.config_of(there)
+            prepared = load_prepared(out, there, own)
+            model, poses, request = prepared.model, [*prepared.resting_poses], self
+            if name != there:
+                model, poses = replace(model, name=name), [np.full((4, 4), np.nan)]
+                reason = f"object must be one of {listed(names)}, got {name!r}"
+                request = replace(self, table=self.table.refuse([reason] * len(objects)))
+            stands = [PlacedObject(model=model, X_TO=X_TO, config=own) for X_TO in poses]
+            rows = [i for i, each in enumerate(objects) if each == name]
+            if self.resting is not None:
+                rows.sort(key=self.resting.__getitem__)
+            placed += request.place(rows, stands, config or own)
+        return placed
+
+    def place(
+        self, rows: Iterable[int], stands: Sequence[PlacedObject], config: Config
+    ) -> list[PlacedGrasp]:
+        """Return some rows on one object, given in each of its resting poses."""
+        table, config = self.table, with_whole_lifts(config)
+        nothing = np.full((load_hand(config.hand_source).num_fingers, 3), np.nan)
+        if isinstance(table, Attempts):
+            # A row that gives the pose of the object is tried in that pose, even if no drop ended
+            # in it.
+            anywhere = replace(table, X_TO=np.full_like(table.X_TO, np.nan))
+            poses, model = np.array([each.X_TO for each in stands]), stands[0].model
+            table = table.refuse(misfits(anywhere, model.name, model.scale, poses))
+        overridden = overridden_keys(self.overrides)
+        given, found = list[PlacedObject](), list[PlacedGrasp]()
+        for i in rows:
+            invalid, tried = table.invalid[i], stands[:1]
+            if not invalid:
+                try:
+                    tried = self._stands_of(i, stands, given)
+                except GraspError as error:
+                    invalid = str(error)
+            told = np.full(3, np.nan) if self.conditions is None else self.conditions[i]
+            under = [_under(each, config, told, overridden) for each in tried]
+            grasp = PlacedGrasp(
+                index=i,
+                stands=tuple(each for each, _ in under),
+                method=self.method,
+                config=under[0][1],
+                invalid=invalid,
+                frame=self.frame,
+                X_TC=None if self.X_TC is None else self.X_TC[i],
+                cameras={name: X_TC[i] for name, X_TC in self.cameras.items()},
+                confidence=np.nan if table.confidence is None else float(table.confidence[i]),
+                rank=-1 if table.confidence is None or table.rank is None else int(table.rank[i]),
+                p_AQ=nothing,
+                nhat_Q_A=nothing,
+                snap_points=self.snap_points,
+            )
+            if isinstance(table, ContactRows):
+                found.append(_with_contacts(grasp, table, i))
+            else:
+                found.append(_with_posture(grasp, table, i))
+        return found
+
+    def _stands_of(
+        self, i: int, stands: Sequence[PlacedObject], given: list[PlacedObject]
+    ) -> Sequence[PlacedObject]:
+        """Return the object in each pose that a row is tried in.
+
+        Args:
+            i: Index of the row.
+            stands: The object in its resting poses.
+            given: The object in poses that rows gave; a new one is added, and equal ones are
+                shared.
+
+        Raises:
+            GraspError: If the row gives a pose in which the object does not stand on the table.
+        """
+        if self.X_TO is None or np.isnan(self.X_TO[i]).any():
+            named = UNTOLD if self.resting is None else int(self.resting[i])
+            if named >= len(stands):
+                raise GraspError(f"resting must be 0 to {len(stands) - 1}, got {named}")
+            return stands if named == UNTOLD else [stands[named]]
+        stood = canonical_pose(self.X_TO[i])
+        for each in (*stands, *given):
+            if np.abs(each.X_TO_simulated - stood).max() < SAME_POSE:
+                return [each]
+        given.append(place_object(stands[0], X_TO=self.X_TO[i]))
+        return given[-1:]
+
+
+def _with_contacts(grasp: PlacedGrasp, table: ContactRows, i: int) -> PlacedGrasp:
+    """Return a grasp with the contacts of a row."""
+    return replace(
+        grasp,
+        p_AQ=table.points[i],
+        nhat_Q_A=table.normals[i],
+        normalised=bool(table.normalised[i]),
     )
-    how: dict[str, Any] = {"method": method, "snap_points": snap_points, "overrides": overrides}
-    return place_on_dataset(table, dataset.path.parent, used, cameras=cameras, **how)
+
+
+def _with_posture(grasp: PlacedGrasp, table: Attempts, i: int) -> PlacedGrasp:
+    """Return a grasp with the posture of a row."""
+    xyzw = None if table.X_FG_xyzw is None else table.X_FG_xyzw[i]
+    there = () if grasp.invalid else grasp.stands
+    return replace(
+        grasp,
+        postures=tuple(table.posture(i, each.X_TO, each.model.X_OM) for each in there),
+        preshapes=table.shapes(i, load_hand(grasp.config.hand_source)),
+        named=table.names_pose(i),
+        X_AG=table.X_FG[i],
+        link=table.link,
+        X_AG_xyzw=None if xyzw is None or np.isnan(xyzw).any() else xyzw,
+    )
+
+
+def _under(
+    placed: PlacedObject, config: Config, conditions: Array, overridden: set[str]
+) -> tuple[PlacedObject, Config]:
+    """Return the object and the configuration under the `CONDITIONS` (3,) of a row."""
+    told, model = dict(zip(CONDITIONS, conditions.tolist(), strict=True)), placed.model
+    mass = told.pop("mass")
+    if np.isfinite(list(told.values())).any():
+        frictions = {n: v if np.isfinite(v) else model.friction for n, v in told.items()}
+        used = {
+            name: value
+            for name, value in frictions.items()
+            if value is not None and f"physics.{name}" not in overridden
+        }
+        # The configuration's values come before the object's own, which would win otherwise.
+        physics = config.physics.model_copy(update=used)
+        config = config.model_copy(update={"physics": physics})
+        model = replace(model, friction=None)
+    if np.isfinite(mass) and "objects.mass" not in overridden and mass != model.mass:
+        # The inertia scales with the mass.
+        model = replace(model, mass=mass, I_OOcm_O=mass / model.mass * model.I_OOcm_O)
+    return (placed if model is placed.model else replace(placed, model=model)), config
+
+
+def _read(grasps: npt.ArrayLike | GraspRows, method: str, config: Config) -> ContactRows | Attempts:
+    """Return a given table of grasps, or read contacts of the configuration's hand."""
+    if method not in METHODS:
+        raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if isinstance(grasps, GraspRows):
+        assert isinstance(grasps, ContactRows | Attempts)
+        return grasps
+    return read_grasps(grasps, load_hand(config.hand_source).num_fingers)
+
+
+def _camera_poses(frame: str, X_TC: npt.ArrayLike | None, count: int) -> Array | None:
+    """Return the poses (n, 4, 4) of the cameras in whose frames contacts are; None without one.
+
+    Args:
+        frame: "object" {O}, "camera" {C}, "table" {T} or "mesh" {M}.
+        X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
+        count: Number of grasps, n.
+
+    Raises:
+        GraspError: If the frame is unknown, or the camera's pose is missing, is given for another
+            frame, or is not one per grasp.
+    """
+    if frame not in FRAMES:
+        raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
+    if X_TC is None:
+        if frame == "camera":
+            raise GraspError(
+                "X_TC must be the camera's pose in the table-top frame (frame_work2cam in the "
+                "files) if frame is camera, got None"
+            )
+        return None
+    poses = read_pose(X_TC, "X_TC")
+    if frame != "camera":
+        raise GraspError(f"X_TC must be None if frame is {frame}, got a pose")
+    each = np.broadcast_to(poses, (count, 4, 4)) if poses.ndim == 2 else poses
+    if len(each) != count:
+        raise GraspError(f"X_TC must be one pose, or one per grasp ({count}), got {len(each)}")
+    return each
 
 
 def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
@@ -247,15 +510,6 @@ def dataset_config(
     return used
 
 
-def _read(grasps: npt.ArrayLike | Attempts, method: str, config: Config) -> Attempts:
-    """Return a given table of attempts, or read contacts of the configuration's hand."""
-    if method not in METHODS:
-        raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    if isinstance(grasps, Attempts):
-        return grasps
-    return read_grasps(grasps, load_hand(config.hand_source).num_fingers)
-
-
 def _drawn(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> Array:
     """Return the `CONDITIONS` (n, 3) that were drawn for rows of a dataset; NaN if not drawn."""
     rules = read_manifest(dataset.path.parent).config.randomize
@@ -318,7 +572,7 @@ def read_several(
     fingers: int,
     rows: RowChoice = None,
     confidence: npt.ArrayLike | None = None,
-) -> Attempts:
+) -> ContactRows:
     """Return predicted contacts for rows of a split; a row may have several predictions.
 
     Args:
@@ -341,153 +595,3 @@ def read_several(
         stated = read_confidence(confidence, array.shape[:-1]).ravel()
     flat = array.reshape(-1, array.shape[-1])
     return read_grasps(flat, fingers, rows=of_row, confidence=stated)
-
-
-def place_on_dataset(
-    table: Attempts, out: Path, config: Config | None = None, **how: Any
-) -> list[PlacedGrasp]:
-    """Return the rows of a table on the objects of a dataset that they name.
-
-    Rows of an object in a resting pose are adjacent, so that its scene is built once.
-
-    Args:
-        table: The attempts.
-        out: Directory of the dataset.
-        config: Configuration for the trials; None for each object's configuration.
-        how: See `_placed`.
-
-    Raises:
-        GraspError: If the rows are postures in the frames of mesh files.
-        DataError: If the dataset cannot be used.
-    """
-    if table.frame == "mesh" and table.points is None:
-        # Meshes of a dataset are exported in {O}: a file cannot say which of both meshes it means.
-        raise GraspError(
-            "frame must not be mesh for postures on a dataset, got mesh: for its exported meshes "
-            "use --frame object, or give the mesh itself (drakegrasp verify FILE --object MESH)"
-        )
-    manifest, placed = read_manifest(out), list[PlacedGrasp]()
-    names = [entry.name for entry in manifest.objects]
-    table = table.refuse(unknown_objects(table, names))
-    for name in dict.fromkeys(table.objects):
-        # An object that does not exist is known by its name alone.
-        there = name if name in names else names[0]
-        own = manifest.config_of(there)
-        prepared = load_prepared(out, there, own)
-        things = [
-            PlacedObject(model=prepared.model, X_TO=X_TO, config=own)
-            for X_TO in prepared.resting_poses
-        ]
-        if name != there:
-            nobody = replace(prepared.model, name=name)
-            things = [PlacedObject(model=nobody, X_TO=np.full((4, 4), np.nan), config=own)]
-        rows = [i for i, each in enumerate(table.objects) if each == name]
-        rows.sort(key=lambda i: table.resting[i])
-        placed += _placed(table, rows, things, config or own, **how)
-    return placed
-
-
-def _placed(
-    table: Attempts,
-    rows: Iterable[int],
-    things: Sequence[PlacedObject],
-    config: Config,
-    *,
-    method: str = "hand",
-    snap_points: bool = False,
-    overrides: Sequence[str] = (),
-    cameras: Mapping[str, Array] | None = None,
-) -> list[PlacedGrasp]:
-    """Return some rows of a table on one object, given in each of its resting poses.
-
-    Args:
-        table: The attempts.
-        rows: Indices of the rows.
-        things: The object in its resting poses.
-        config: Configuration for the trials.
-        method: Method for contacts.
-        snap_points: See `PlacedGrasp`.
-        overrides: Settings of the caller; they take precedence over the conditions of a row.
-        cameras: Poses X_TC (n, 4, 4) for all rows of the table, by their frames.
-    """
-    model, known_cameras = things[0].model, dict(cameras or {})
-    if table.points is None:
-        method = "posture"
-        known_cameras |= {} if table.X_TC is None else {CAMERA: table.X_TC}
-
-    # A row that gives the pose of the object is tried in that pose, even if no drop ended in it.
-    anywhere = replace(table, X_TO=np.full_like(table.X_TO, np.nan))
-    poses = np.array([thing.X_TO for thing in things])
-    table = table.refuse(misfits(anywhere, model.name, model.scale, poses))
-    stands, overridden, found = _Stands(things), overridden_keys(overrides), list[PlacedGrasp]()
-    for i in rows:
-        attempt, lying = table.at([i]), things[:1]
-        try:
-            lying = lying if table.invalid[i] else stands.of(table, i)
-        except GraspError as error:
-            attempt = attempt.refuse([str(error)])
-        tried = [stands.under(each, config, table.conditions[i], overridden) for each in lying]
-        found.append(
-            PlacedGrasp(
-                index=i,
-                attempt=attempt,
-                stands=tuple(thing for thing, _ in tried),
-                method=method,
-                config=tried[0][1],
-                snap_points=snap_points,
-                cameras={name: X_TC[i] for name, X_TC in known_cameras.items()},
-            )
-        )
-    return found
-
-
-class _Stands:
-    """An object in its resting poses and in poses that rows give; equal poses share an object."""
-
-    def __init__(self, things: Sequence[PlacedObject]) -> None:
-        self._dropped, self._told = list(things), list[PlacedObject]()
-        self._known: dict[tuple[int, bytes], tuple[PlacedObject, Config]] = {}
-
-    def of(self, table: Attempts, i: int) -> Sequence[PlacedObject]:
-        """Return the object in each pose that a row is tried in.
-
-        Raises:
-            GraspError: If the row gives a pose in which the object does not stand on the table.
-        """
-        X_TO = table.X_TO[i]
-        if np.isnan(X_TO).any():
-            named = int(table.resting[i])
-            return self._dropped if named == UNTOLD else [self._dropped[named]]
-        stood = canonical_pose(X_TO)
-        for thing in (*self._dropped, *self._told):
-            if np.abs(thing.X_TO_simulated - stood).max() < SAME_POSE:
-                return [thing]
-        self._told.append(place_object(self._dropped[0], X_TO=X_TO))
-        return self._told[-1:]
-
-    def under(
-        self, thing: PlacedObject, config: Config, conditions: Array, overridden: set[str]
-    ) -> tuple[PlacedObject, Config]:
-        """Return the object and the configuration under the conditions of a row."""
-        key = (id(thing), conditions.tobytes())
-        if key not in self._known:
-            told = dict(zip(CONDITIONS, conditions.tolist(), strict=True))
-            mass, model = told.pop("mass"), thing.model
-            if np.isfinite(list(told.values())).any():
-                frictions = {n: v if np.isfinite(v) else model.friction for n, v in told.items()}
-                used = {
-                    name: value
-                    for name, value in frictions.items()
-                    if value is not None and f"physics.{name}" not in overridden
-                }
-                # The configuration's values come before the object's own, which would win
-                # otherwise.
-                physics = config.physics.model_copy(update=used)
-                config = config.model_copy(update={"physics": physics})
-                model = replace(model, friction=None)
-            if np.isfinite(mass) and "objects.mass" not in overridden and mass != model.mass:
-                # The inertia scales with the mass.
-                model = replace(model, mass=mass, I_OOcm_O=mass / model.mass * model.I_OOcm_O)
-            same = model is thing.model
-            self._known[key] = thing if same else replace(thing, model=model), config
-        return self._known[key]

@@ -1,4 +1,4 @@
-"""Predicted contacts: grasp vectors become a table of attempts.
+"""Predicted contacts: grasp vectors become a table of contact points and normals.
 
 Input: grasp vectors in one of four frames, as a network returned them. Output: contact points and
 unit normals in that frame, or the reason why a row is not a valid grasp. An array that cannot hold
@@ -7,7 +7,7 @@ grasps at all is an error, with a message of one line.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -16,17 +16,35 @@ import numpy.typing as npt
 from drakegrasp.config import LARGEST
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import FARTHEST, Array, as_numbers, without_torch
-from drakegrasp.simulation.attempts import CONDITIONS, UNTOLD, Attempts
+from drakegrasp.simulation.attempts import GraspRows
 
 Frame = Literal["object", "camera", "table", "mesh"]
 FRAMES: tuple[str, ...] = get_args(Frame)
-#: An earlier name of the frame "table", which is still accepted.
-WORKSPACE = "workspace"
-
 #: A normal whose length differs from one by more than this is reported as normalised.
 NORMAL_TOLERANCE = 0.01
 #: Length below which a normal has no direction.
 SHORTEST_NORMAL = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContactRows(GraspRows):
+    """n grasps of k contacts, without wrist and joints, built by `read_grasps`.
+
+    Attributes:
+        grasps: (n, 6k), the numbers as they were given.
+        points, normals: (n, k, 3), contact points [m] and unit normals in the frame of the caller;
+            NaN in rows without a valid grasp.
+        normalised: (n,), whether a normal was not of unit length.
+    """
+
+    grasps: Array
+    points: Array
+    normals: Array
+    normalised: npt.NDArray[np.bool_]
+
+    def numbers(self) -> Array:
+        """Return the numbers (n, 6k) as they were given."""
+        return self.grasps
 
 
 def read_grasps(
@@ -35,7 +53,7 @@ def read_grasps(
     *,
     rows: npt.NDArray[np.int64] | None = None,
     confidence: Array | None = None,
-) -> Attempts:
+) -> ContactRows:
     """Return the grasps of grasp vectors (n, 6k); a bad row does not affect other rows.
 
     Args:
@@ -70,20 +88,8 @@ def read_grasps(
     # Normalise the remaining normals.
     bad = np.array([bool(reason) for reason in invalid], dtype=np.bool_)
     points[bad], normals[bad], length[bad] = np.nan, np.nan, 1.0
-    count, nothing = len(array), np.full((len(array), 0), np.nan)
-    return Attempts(
-        objects=("",) * count,
-        resting=np.full(count, UNTOLD, dtype=np.int64),
-        X_TO=np.full((count, 4, 4), np.nan),
-        X_FG=np.full((count, 4, 4), np.nan),
-        q_grasp=nothing,
-        q_pregrasp=nothing,
-        q_squeeze=nothing,
-        scale=np.full(count, np.nan),
-        said=("",) * count,
-        preshape=("",) * count,
-        conditions=np.full((count, len(CONDITIONS)), np.nan),
-        row=np.arange(count, dtype=np.int64),
+    return ContactRows(
+        row=np.arange(len(array), dtype=np.int64),
         invalid=tuple(invalid),
         of_row=rows,
         confidence=confidence,
@@ -127,33 +133,3 @@ def _shape(row: Any) -> tuple[int, ...] | None:
         return as_numbers(row, "").shape
     except GraspError:
         return None
-
-
-def in_frame(table: Attempts, frame: str, X_TC: Array | None) -> Attempts:
-    """Return the table with the frame that the caller specifies for its contacts.
-
-    Args:
-        table: Table of n grasps.
-        frame: "object" {O}, "camera" {C}, "table" {T} or "mesh" {M}.
-        X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
-
-    Raises:
-        GraspError: If the frame is unknown, or the camera's pose is missing, is given for another
-            frame, or is not one per grasp.
-    """
-    frame = "table" if frame == WORKSPACE else frame
-    if frame not in FRAMES:
-        raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
-    if frame == "camera" and X_TC is None:
-        raise GraspError(
-            "X_TC must be the camera's pose in the table-top frame (frame_work2cam in the files) "
-            "if frame is camera, got None"
-        )
-    if X_TC is None:
-        return replace(table, frame=frame)
-    if frame != "camera":
-        raise GraspError(f"X_TC must be None if frame is {frame}, got a pose")
-    each = np.broadcast_to(X_TC, (len(table), 4, 4)) if X_TC.ndim == 2 else X_TC
-    if len(each) != len(table):
-        raise GraspError(f"X_TC must be one pose, or one per grasp ({len(table)}), got {len(each)}")
-    return replace(table, frame=frame, X_TC=each)

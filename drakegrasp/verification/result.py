@@ -9,7 +9,8 @@ inwards, are reported first.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,13 +24,22 @@ from drakegrasp.generation.attempts import unjudged
 from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.verification.forces import ForceVerdict
-from drakegrasp.verification.hints import FAR, FAR_POSTURE, REVERSED
+from drakegrasp.verification.forces import ForceVerdict, force_margin
+from drakegrasp.verification.hints import (
+    FAR,
+    FAR_POSTURE,
+    Reading,
+    contact_readings,
+    posture_readings,
+)
+from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.wrist_solver import WristFit
 
 if TYPE_CHECKING:
@@ -66,60 +76,154 @@ class PoseTrial:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Verification:
-    """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
-
-    The grasp is judged by its first wrist pose, which fits the contacts best.
+class Findings:
+    """What was found about a grasp: a verdict without the grasp and the object's meshes.
 
     Attributes:
-        method: "hand", "forces" or "posture".
         outcome: Outcome of the trial of the first wrist pose, as in a dataset; or `invalid`; or
             `off_surface` with method `forces`.
         reason: Reason for the outcome, in one sentence without a full stop.
-        placed: The object and its pose on the table.
-        config: Hand, physics, lift and rules of the verification.
         p_OQ, nhat_Q_O: (k, 3), the contact points [m] and unit normals in {O} that were tried; NaN
             for an invalid row or a posture.
         surface_distance: (k,), distances of the predicted points from the object's surface [m].
-        fingertip_distance: For a posture that fails, distances of the fingertips of its grasp from
-            the surface [m], one per finger that it closes; None for all other grasps.
-        normalised: Whether a predicted normal was not of unit length, and was normalised.
-        snapped: Whether the points were moved to the closest points of the surface.
-        hints: Readings in which a grasp that fails would fit much better, see
-            `verification.hints`.
+        posture: The posture that was tried, in {O}; None for contacts.
         tries: The wrist poses that were simulated, in order.
         forces: What forces at the contacts alone can do, with method `forces`.
-        epsilon: Ferrari-Canny measure of the contacts; 0 without force closure.
-        smallest_friction: Smallest friction coefficient at which forces within the hand's limit
-            hold the object at the contacts; inf if no coefficient suffices.
         seconds: Wall-clock time by stage [s].
         stand: Index of the resting pose of this verdict: the best of those in which a posture was
             tried.
-        confidence: Confidence of the grasp in the caller's file; NaN if the file has none.
-        rank: Rank by confidence among the grasps for the same row, or of the same object; 0 for the
-            best, -1 without confidence.
+        margin: Epsilon and smallest friction, if they were computed already.
+        doubts: Readings and fingertip distances, if they were computed already.
     """
 
-    method: str
     outcome: Outcome
     reason: str
-    placed: PlacedObject
-    config: Config
     p_OQ: Array
     nhat_Q_O: Array
     surface_distance: Array
-    fingertip_distance: Array | None = None
-    normalised: bool = False
-    snapped: bool = False
-    hints: tuple[str, ...] = ()
+    posture: Posture | None = None
     tries: tuple[PoseTrial, ...] = ()
     forces: ForceVerdict | None = None
-    epsilon: float = np.nan
-    smallest_friction: float = np.nan
     seconds: dict[str, float] = field(default_factory=dict)
     stand: int = 0
-    confidence: float = np.nan
-    rank: int = -1
+    margin: tuple[float, float] | None = None
+    doubts: tuple[tuple[Reading, ...], Array | None] | None = None
+
+    def of(self, grasp: PlacedGrasp) -> Verification:
+        """Return the verdict on the grasp that this was found about."""
+        return Verification(grasp=grasp, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Verification(Findings):
+    """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
+
+    The grasp is judged by its first wrist pose, which fits the contacts best. Margins and hints are
+    computed when they are asked for.
+
+    Attributes:
+        grasp: The grasp on its object, as it was requested.
+    """
+
+    grasp: PlacedGrasp
+
+    @property
+    def method(self) -> str:
+        """The way of verification: "hand", "forces" or "posture"."""
+        return self.grasp.method
+
+    @property
+    def placed(self) -> PlacedObject:
+        """The object and its pose on the table."""
+        return self.grasp.stands[self.stand]
+
+    @property
+    def config(self) -> Config:
+        """Hand, physics, lift and rules of the verification."""
+        return self.grasp.config
+
+    @property
+    def normalised(self) -> bool:
+        """Whether a predicted normal was not of unit length, and was normalised."""
+        return self.grasp.normalised
+
+    @property
+    def snapped(self) -> bool:
+        """Whether the points were moved to the closest points of the surface."""
+        return self.grasp.snap_points and not self.grasp.invalid
+
+    @property
+    def confidence(self) -> float:
+        """Confidence of the grasp in the caller's file; NaN if the file has none."""
+        return self.grasp.confidence
+
+    @property
+    def rank(self) -> int:
+        """Rank by confidence among the grasps for the same row, or of the same object.
+
+        It is 0 for the best, -1 without confidence.
+        """
+        return self.grasp.rank
+
+    @property
+    def epsilon(self) -> float:
+        """Ferrari-Canny measure of the contacts; 0 without force closure."""
+        return self._margin[0]
+
+    @property
+    def smallest_friction(self) -> float:
+        """Smallest friction coefficient at which forces hold the object at the contacts.
+
+        The forces are within the hand's limit; it is inf if no coefficient suffices.
+        """
+        return self._margin[1]
+
+    @cached_property
+    @one_thread
+    def _margin(self) -> tuple[float, float]:
+        if self.margin is not None:
+            return self.margin
+        if self.posture is not None or self.grasp.invalid:
+            return np.nan, np.nan
+        with timed(self.seconds, "margin"):
+            X_TO = self.placed.X_TO_simulated
+            return force_margin(self.placed.model, X_TO, self.p_OQ, self.nhat_Q_O, self.config)
+
+    @property
+    def hints(self) -> tuple[str, ...]:
+        """Readings in which a grasp that fails would fit much better, in words."""
+        return tuple(reading.text for reading in self._doubts[0])
+
+    @property
+    def fingertip_distance(self) -> Array | None:
+        """For a posture that fails, distances of its grasp's fingertips from the surface [m].
+
+        There is one per finger that the posture closes; it is None for all other grasps.
+        """
+        return None if self.posture is None else self._doubts[1]
+
+    @cached_property
+    @one_thread
+    def _doubts(self) -> tuple[tuple[Reading, ...], Array | None]:
+        """Readings that fit much better, and the distances of a posture's fingertips."""
+        if self.doubts is not None:
+            return self.doubts
+        fits = self.held if self.posture else self.success and not self.misplaced
+        if fits or self.grasp.invalid or self.outcome.inconclusive:
+            return (), None
+        with timed(self.seconds, "hints"):
+            if self.posture is not None:
+                return posture_readings(self.grasp, self.placed, self.posture)
+            return contact_readings(self.grasp, self.nhat_Q_O, fits=self.success), None
+
+    def explained(self) -> Findings:
+        """Return what was found, with margins and hints, which are computed now."""
+        return replace(self, margin=self._margin, doubts=self._doubts).findings
+
+    @property
+    def findings(self) -> Findings:
+        """What was found, without the grasp."""
+        return Findings(**{f.name: getattr(self, f.name) for f in fields(Findings)})
 
     @property
     def success(self) -> bool:
@@ -310,7 +414,7 @@ def _largest(values: Array | None) -> float:
 
 def _sentences(verified: Verification) -> Iterator[str]:
     # Faults in the numbers come first: if there are any, all else is about another grasp.
-    inwards = REVERSED in verified.hints
+    inwards = any(reading.reversed for reading in verified._doubts[0])
     if verified.misplaced:
         yield from _misplaced(verified)
     elif inwards:

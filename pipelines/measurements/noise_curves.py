@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import binomtest
 
-from drakegrasp.api.verifying import verify_rows
+from drakegrasp.api.verifying import verify_grasps
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES
@@ -93,10 +93,10 @@ def verdicts(
         for (kind, size), contacts in asked.items():
             if (trial, kind, size) in done:
                 continue
-            (verdict,) = verify_rows(
-                data,
+            (verdict,) = verify_grasps(
                 np.concatenate([part.ravel() for part in contacts])[None],
-                [row],
+                data,
+                rows=[row],
                 frame="object",
                 snap_points=kind == "snapped",
                 config=config,

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.api.verifying import verify_rows
+from drakegrasp.api.verifying import verify_grasps
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
@@ -55,8 +55,8 @@ def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
             key: str, method: str, grasps: Array, data: GraspDataset, rows: list[int], **where: Any
         ) -> None:
             if len(grasps):
-                verdicts = verify_rows(
-                    data, grasps, rows, client=client, method=method, show=True, **where
+                verdicts = verify_grasps(
+                    grasps, data, rows=rows, client=client, method=method, show=True, **where
                 )
                 results.setdefault(method, {}).setdefault(key, []).extend(verdicts)
 

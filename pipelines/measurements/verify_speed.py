@@ -21,7 +21,7 @@ import numpy as np
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.verification.placing import PlacedGrasp, place_on_rows
+from drakegrasp.verification.placing import PlacedGrasp, dataset_config, place_on_rows
 from drakegrasp.verification.verify import verify_placed
 
 #: Maximum number of grasps per object in the second measurement.
@@ -62,7 +62,7 @@ def _grasps(
             points = slice(grasps.shape[1] // 2)
             noise = generator.normal(0.0, SIGMA, grasps[:, points].shape)
             grasps[moved, points] += noise[moved]
-            yield from place_on_rows(grasps, data, rows)
+            yield from place_on_rows(grasps, data, rows, config=dataset_config(data))
 
 
 def _measure(grasps: list[PlacedGrasp]) -> dict[str, object]:

@@ -139,7 +139,7 @@ def test_a_verdict_ranks_by_object_and_by_row(out: Path, tmp_path: Path) -> None
     where = {"grasps": path, "dataset": out / OTO, "frame": "object", "link": "palm"}
     placed, _, rows = place_requested(VerifyRequest(**where))
     assert rows is None
-    assert [int(grasp.attempt.rank[0]) for grasp in placed] == [1, 0]
+    assert [grasp.rank for grasp in placed] == [1, 0]
 
     # A mesh of half the size is another object.
     write_json(path, object=thing | {"scale": 0.5})
@@ -152,6 +152,6 @@ def test_a_verdict_ranks_by_object_and_by_row(out: Path, tmp_path: Path) -> None
     assert rows is not None
     own = [row for row, name in enumerate(names) if name == names[0]]
     assert rows.row.tolist() == own * 2
-    found = {grasp.index: int(grasp.attempt.rank[0]) for grasp in placed}
+    found = {grasp.index: grasp.rank for grasp in placed}
     assert [found[i] for i in range(len(found))] == [1] * len(own) + [0] * len(own)
     assert {grasp.placed.model.name for grasp in placed} == {names[0]}

@@ -16,8 +16,8 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture
-from drakegrasp.verification.hints import _fingertips, find_posture_hints
-from drakegrasp.verification.placing import PlacedGrasp
+from drakegrasp.verification.hints import fingertips, posture_readings
+from drakegrasp.verification.placing import place_on_object
 
 #: What the public descriptions say: the palm link's pose in the tool's frame, as position and
 #: quaternion w, x, y, z. GraspGen's hand.stl is the panda_hand's collision mesh turned by +90
@@ -44,7 +44,7 @@ def described(name: str, tool: str) -> np.ndarray:
 
 def object_at(hand, X_OG: np.ndarray) -> trimesh.Trimesh:
     """An object with a cube at each fingertip of the half closed hand, and a lump on one side."""
-    points = _fingertips(hand, Posture(X_OG)) @ X_OG[:3, :3].T + X_OG[:3, 3]
+    points = fingertips(hand, Posture(X_OG)) @ X_OG[:3, :3].T + X_OG[:3, 3]
     cubes = [trimesh.creation.box([0.012] * 3).apply_translation(p + LIFTED) for p in points]
     lump = trimesh.creation.box([0.03, 0.02, 0.02]).apply_translation(points.mean(0) + 0.03)
     return trimesh.util.concatenate([*cubes, lump])
@@ -69,11 +69,9 @@ def test_a_frame_that_is_turned_is_found(tmp_path, name, tool):
         spread = np.linalg.norm(posture.X_OG[:3, 3] - X_OG[:3, 3])
         turn = Rotation.from_matrix(posture.X_OG[:3, :3].T @ X_OG[:3, :3]).magnitude()
         placed = PlacedObject(model=model, X_TO=np.eye(4), config=config)
-        grasp = PlacedGrasp(
-            index=0, attempt=table, stands=(placed,), method="posture", config=config
-        )
-        hints, _ = find_posture_hints(grasp, placed, posture)
-        return float(spread + turn), hints
+        (grasp,) = place_on_object(table, placed)
+        readings, _ = posture_readings(grasp, placed, posture)
+        return float(spread + turn), tuple(reading.text for reading in readings)
 
     assert off(X_OA, tool) == (pytest.approx(0.0, abs=1e-6), ())
     for axis in np.eye(3):

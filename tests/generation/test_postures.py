@@ -338,7 +338,7 @@ def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path
     own, again = (place_on_object(each, placed) for each in (table, moved))
     assert not any(grasp.invalid for grasp in (*own, *again))
     for one, other in zip(own, again, strict=True):
-        poses = [each.posture(each.placed).X_OG for each in (one, other)]
+        poses = [each.postures[0].X_OG for each in (one, other)]
         np.testing.assert_allclose(*poses, atol=1e-9)
     with pytest.raises(GraspError, match="for its exported meshes use --frame object, or give"):
         place_on_dataset(moved, tmp_path)

@@ -11,7 +11,7 @@ import pytest
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import SMALL
 
-from drakegrasp.api.verifying import verify_rows
+from drakegrasp.api.verifying import verify_grasps
 from drakegrasp.config import Config
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
@@ -107,7 +107,9 @@ def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) 
     rows = [len(data) - 1, 0]
     grasps = np.array([data[row].grasp for row in rows])
     usual = load_prepared(randomized, NAME, read_manifest(randomized).config).model
-    for row, verdict in zip(rows, verify_rows(data, grasps, rows, method="forces"), strict=True):
+    for row, verdict in zip(
+        rows, verify_grasps(grasps, data, rows=rows, method="forces"), strict=True
+    ):
         props, conditions = data[row].props, data[row].conditions
         model = verdict.placed.model
         assert model.mass == pytest.approx(float(props["work2mass"][0]))

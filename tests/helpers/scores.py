@@ -11,7 +11,7 @@ import numpy as np
 
 from drakegrasp.scoring.measures import Grouping, Judged
 from drakegrasp.scoring.verdict import Verdict, rank_array, verdict_of
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspRows
 
 FAILS = Verdict(
     outcome="dropped",
@@ -53,7 +53,7 @@ class Rows:
         return np.zeros((self.length, 18))
 
 
-def ranked_array(name: str, grasps: Any, *, length: int, **stated: Any) -> Attempts:
+def ranked_array(name: str, grasps: Any, *, length: int, **stated: Any) -> GraspRows:
     """Return predictions for a split of so many rows, in the order of rows and ranks."""
     return rank_array(name, grasps, Rows(length), **stated)  # type: ignore[arg-type]
 

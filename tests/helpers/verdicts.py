@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from helpers.objects import standing
 
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, make_pose
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
+from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import Closed, TrialRecord
 from drakegrasp.table import Table
 from drakegrasp.verification.forces import ContactForces, ForceVerdict
-from drakegrasp.verification.result import PoseTrial
+from drakegrasp.verification.placing import PlacedGrasp
+from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.wrist_solver import WristFit
 
 
@@ -72,6 +78,31 @@ def some_try(trial: TrialRecord, **values: Any) -> PoseTrial:
         "normal_error": np.deg2rad([3.0, 4.0, 5.0]), "removal": Removal.KEPT if held else None,
     }  # fmt: skip
     return PoseTrial(**usual | values)
+
+
+def some_verdict(model: ObjectModel, **values: Any) -> Verification:
+    """Return a verdict on contacts of three fingertips on an object, with other values where given.
+
+    Fields of the grasp may be among the values. Margins and hints are none, unless given.
+    """
+    nothing = np.full((3, 3), np.nan)
+    grasp: dict[str, Any] = {
+        "index": 0, "stands": (PlacedObject(model=model, X_TO=standing(model)),),
+        "method": "hand", "config": load_config(), "p_AQ": nothing, "nhat_Q_A": nothing,
+    }  # fmt: skip
+    names = {f.name for f in fields(PlacedGrasp)}
+    grasp |= {name: values.pop(name) for name in names & values.keys()}
+    usual: dict[str, Any] = {
+        "outcome": Outcome.DROPPED, "reason": "so it is", "p_OQ": np.zeros((3, 3)),
+        "nhat_Q_O": np.eye(3), "surface_distance": np.zeros(3), "margin": (np.nan, np.nan),
+        "doubts": ((), None),
+    }  # fmt: skip
+    return Verification(grasp=PlacedGrasp(**grasp), **usual | values)
+
+
+def asked_otherwise(verdict: Verification, **values: Any) -> Verification:
+    """Return a verdict on a grasp with other values."""
+    return replace(verdict, grasp=replace(verdict.grasp, **values))
 
 
 def some_forces(*, points: float = 0.5, patches: float = 0.25) -> ForceVerdict:

@@ -18,7 +18,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.scoring.verdict import rank_file
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.verification.placing import place_on_rows
+from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 HAND = load_hand()
 
@@ -78,9 +78,12 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(data, tm
     given |= {"X_FG": X_CG, "resting": np.full(len(rows), 7)}
     np.savez(tmp_path / "p.npz", **given, frame="camera")
     table = rank_file(tmp_path / "p.npz", data)
-    placed = sorted(place_on_rows(table, data, rows.tolist()), key=lambda g: g.index)
+    placed = sorted(
+        place_on_rows(table, data, rows.tolist(), config=dataset_config(data)),
+        key=lambda g: g.index,
+    )
     for grasp, X_OG, row in zip(placed, X_OGs, rows.tolist(), strict=True):
-        np.testing.assert_allclose(grasp.posture(grasp.placed).X_OG, X_OG, atol=1e-5)
+        np.testing.assert_allclose(grasp.postures[0].X_OG, X_OG, atol=1e-5)
         assert grasp.placed.model.name == data.value("object_props/object_name", row)
 
 

@@ -214,10 +214,10 @@ def test_objects_of_equal_names_and_other_meshes_are_other_objects(data, tmp_pat
 
 
 def test_own_contacts_are_those_that_are_tried(data):
-    placed = place_on_rows(data.column("grasps"), data)
+    placed = place_on_rows(data.column("grasps"), data, config=dataset_config(data))
     for each in placed:
         found = own_contacts(data, [each.index])[0]
-        np.testing.assert_allclose(found.reshape(3, 3), each.contacts()[0], atol=1e-6)
+        np.testing.assert_allclose(found.reshape(3, 3), each.in_object_frame()[0], atol=1e-6)
 
 
 def test_files_of_a_card_are_whole_and_come_again(data, tmp_path):

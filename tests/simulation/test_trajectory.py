@@ -12,7 +12,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import fingertip_forces
 from drakegrasp.hand.settings import load_config
 from drakegrasp.simulation.lift import LiftPath, carrying_force, lift_path
-from drakegrasp.verification.forces import force_margin, hand_contacts
+from drakegrasp.verification.forces import force_margin
 
 GRAVITY = 9.81
 HALF = CUBE / 2.0
@@ -81,9 +81,7 @@ def test_path_of_an_object_at_its_target_stays(cube):
 def test_margin_of_a_pinched_cube_is_its_closed_form(cube):
     """The finger that opposes two carries half of the load: mu = m (g + a) / (2 limit)."""
     config = load_config()
-    epsilon, friction = force_margin(
-        cube, standing(cube), hand_contacts(cube, P, N, config), config
-    )
+    epsilon, friction = force_margin(cube, standing(cube), P, N, config)
     load = lift_path(standing(cube), config).wrenches(cube)[0, 5]
     limit = fingertip_forces(load_hand(config.hand), "worm")[2]
     assert load > cube.mass * GRAVITY
@@ -94,8 +92,6 @@ def test_margin_of_a_pinched_cube_is_its_closed_form(cube):
 @pytest.mark.parametrize(("p", "n"), [(np.abs(P), np.abs(N)), (P * np.nan, N)])
 def test_contacts_that_cannot_hold_have_no_margin(cube, p, n):
     config = load_config()
-    epsilon, friction = force_margin(
-        cube, standing(cube), hand_contacts(cube, p, n, config), config
-    )
+    epsilon, friction = force_margin(cube, standing(cube), p, n, config)
     assert epsilon == 0.0
     assert friction == np.inf

@@ -9,7 +9,7 @@ import pytest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 from helpers.objects import CUBE, box_model, from_above, standing
-from helpers.verdicts import some_fit, some_forces, some_try
+from helpers.verdicts import some_fit, some_forces, some_try, some_verdict
 from matplotlib.image import imread
 
 from drakegrasp.frames import X_WT
@@ -18,11 +18,9 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.style import save_figure
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene import palm_pose
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.figure import FAILS, HELD, STABLE, verification_figure
-from drakegrasp.verification.result import Verification
 
 pytestmark = pytest.mark.sim
 
@@ -56,14 +54,7 @@ def verified(cube):
     """Return a function that makes a result, of a grasp that was not tried unless told."""
 
     def make(**values):
-        result: dict[str, object] = {
-            "outcome": Outcome.DROPPED, "reason": "so it is",
-            "placed": PlacedObject(model=cube, X_TO=standing(cube)),
-            "method": "hand", "surface_distance": np.zeros(3),
-            "p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O,
-            "config": load_config(),
-        }  # fmt: skip
-        return Verification(**result | values)  # type: ignore[arg-type]
+        return some_verdict(cube, **{"p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O, **values})
 
     return make
 

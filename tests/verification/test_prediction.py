@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -13,15 +15,11 @@ from drakegrasp.frames import (
     make_pose,
     pack_pose,
     read_pose,
-    rotate_vectors,
-    transform_points,
 )
 from drakegrasp.grasp import pack_grasp, transform_grasp
-from drakegrasp.verification.prediction import (
-    FRAMES,
-    in_frame,
-    read_grasps,
-)
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.verification.placing import place_on_object
+from drakegrasp.verification.prediction import FRAMES, read_grasps
 
 
 def one_grasp(seed=0, k=3):
@@ -155,6 +153,12 @@ def test_what_is_no_numbers_is_refused(value, got):
 # Frames
 
 
+def placed_at(X_TO, X_OM):
+    """Return an object at a pose, whose file has this frame; of both, only the poses are read."""
+    model = SimpleNamespace(X_OM=X_OM)
+    return PlacedObject(model=model, X_TO=X_TO)
+
+
 @pytest.mark.parametrize("single", [False, True], ids=["float64", "float32 rows"])
 @pytest.mark.parametrize("cameras", [1, 4], ids=["one camera", "one per grasp"])
 def test_the_frames_agree(single, cameras):
@@ -179,26 +183,24 @@ def test_the_frames_agree(single, cameras):
         ),
     }
     assert set(grasps) == set(FRAMES)
-    expected = read_grasps(grasps_O, 3)
+    placed = placed_at(X_TO, X_OM)
     for frame, values in grasps.items():
-        read = read_grasps(values, 3)
-        read = in_frame(read, frame, X if frame == "camera" else None)
-        for i in range(len(read)):
-            X_OA = read.frame_pose(i, X_TO, X_OM)
-            p_OQ = transform_points(X_OA, read.points[i])
-            nhat_Q_O = rotate_vectors(X_OA, read.normals[i])
-            np.testing.assert_allclose(p_OQ, expected.points[i], atol=1e-12)
-            np.testing.assert_allclose(nhat_Q_O, expected.normals[i], atol=1e-12)
+        where = {"X_TC": X} if frame == "camera" else {}
+        for grasp, due in zip(
+            place_on_object(values, placed, frame=frame, **where), grasps_O, strict=True
+        ):
+            found = pack_grasp(*grasp.in_object_frame())
+            np.testing.assert_allclose(found, due, atol=1e-12)
     if single:
         np.testing.assert_allclose(X, np.squeeze(X_TC), atol=1e-6)
 
 
 @pytest.mark.parametrize("frame", FRAMES)
 def test_no_grasps_have_no_contacts_in_any_frame(frame):
-    read = read_grasps(np.zeros((0, 18)), 3)
-    assert read.points.shape == read.normals.shape == (0, 3, 3)
-    for X in [np.eye(4), np.zeros((0, 4, 4))] if frame == "camera" else [None]:
-        assert len(in_frame(read, frame, X)) == 0
+    none = np.zeros((0, 18))
+    for X_TC in [np.eye(4), np.zeros((0, 4, 4))] if frame == "camera" else [None]:
+        placed = placed_at(np.eye(4), np.eye(4))
+        assert place_on_object(none, placed, frame=frame, X_TC=X_TC) == []
 
 
 @pytest.mark.parametrize(
@@ -223,5 +225,6 @@ def test_no_grasps_have_no_contacts_in_any_frame(frame):
     ],
 )
 def test_a_frame_out_of_place_is_refused(frame, X, message):
-    text = refused(in_frame, read_grasps(np.ones((2, 18)), 3), frame, X)
+    placed = placed_at(np.eye(4), np.eye(4))
+    text = refused(place_on_object, np.ones((2, 18)), placed, frame=frame, X_TC=X)
     assert text.startswith(message)

@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.objects import standing
-from helpers.verdicts import some_contacts, some_forces, some_trial, some_try
+from helpers.verdicts import (
+    asked_otherwise,
+    some_contacts,
+    some_forces,
+    some_trial,
+    some_try,
+    some_verdict,
+)
 
 from drakegrasp.filters import Removal
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.verification.result import Verification
+from drakegrasp.verification.hints import Reading
 
 CONFIG = load_config()
 
@@ -37,17 +43,7 @@ def lifted(*, slip_mm, turn_deg, links, outcome=Outcome.SUCCESS):
         slip=1e-3 * slip_mm,
         turn=np.deg2rad(turn_deg),
     )
-    return Verification(
-        method="hand",
-        outcome=outcome,
-        reason="so it is",
-        placed=PlacedObject(model=model, X_TO=trial.X_TO),
-        config=CONFIG,
-        p_OQ=np.zeros((3, 3)),
-        nhat_Q_O=np.eye(3),
-        surface_distance=np.zeros(3),
-        tries=(some_try(trial, removal=removal),),
-    )
+    return some_verdict(model, outcome=outcome, tries=(some_try(trial, removal=removal),))
 
 
 @pytest.mark.parametrize(
@@ -108,12 +104,7 @@ def test_explanation_of_a_lost_object_gives_no_mark():
 
 def test_what_forces_alone_hold_is_a_precision_grasp_that_is_stable():
     """Nothing moves where forces balance."""
-    verdict = replace(
-        lifted(slip_mm=90.0, turn_deg=0.0, links=0),
-        tries=(),
-        method="forces",
-        forces=some_forces(),
-    )
+    verdict = replace(lifted(slip_mm=90.0, turn_deg=0.0, links=0), tries=(), forces=some_forces())
     assert verdict.words == "held, precision, stable"
 
 
@@ -130,12 +121,9 @@ def test_explanation_says_whether_it_is_a_sample_and_what_is_not_judged(removal,
 
 
 def test_hints_and_normalised_normals_are_told():
-    verdict = replace(
-        lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED),
-        hints=("points in millimetres instead of metres",),
-        normalised=True,
-    )
-    text = verdict.explain()
+    verdict = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED)
+    verdict = replace(verdict, doubts=((Reading(factor=1e-3),), None))
+    text = asked_otherwise(verdict, normalised=True).explain()
     assert "A predicted normal was not of unit length; it was normalised." in text
     assert text.endswith("This would fit much better: points in millimetres instead of metres.")
 

@@ -10,8 +10,14 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from helpers.objects import standing
-from helpers.verdicts import some_contacts, some_forces, some_trial, some_try
+from helpers.verdicts import (
+    asked_otherwise,
+    some_contacts,
+    some_forces,
+    some_trial,
+    some_try,
+    some_verdict,
+)
 
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
 from drakegrasp.errors import DataError
@@ -19,8 +25,7 @@ from drakegrasp.frames import make_pose, pack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.verification.result import Verification
+from drakegrasp.verification.hints import Reading
 from drakegrasp.verification.result_files import (
     json_line,
     part_path,
@@ -55,13 +60,11 @@ def results():
     model = make_object(
         box.vertices, box.faces, CONFIG.objects, name="чашка", class_name="cup", mesh_sha256=""
     )
-    placed = PlacedObject(model=model, X_TO=standing(model))
-    asked = Verification(
-        method="hand",
+    asked = some_verdict(
+        model,
+        config=CONFIG,
         outcome=Outcome.INVALID,
         reason="number 1 is nan, not finite",
-        placed=placed,
-        config=CONFIG,
         p_OQ=RNG.normal(size=(3, 3)),
         nhat_Q_O=np.tile([0.0, 0.0, 1.0], (3, 1)),
         surface_distance=np.array([0.02, 0.0, 0.0]),
@@ -70,27 +73,26 @@ def results():
     nothing = np.full((3, 3), np.nan)
     invalid = replace(asked, p_OQ=nothing, nhat_Q_O=nothing, surface_distance=nothing[0])
     trial = some_trial(
-        placed.X_TO, contacts(), contacts(), outcome=Outcome.SUCCESS, slip=0.002, turn=0.01
+        asked.placed.X_TO, contacts(), contacts(), outcome=Outcome.SUCCESS, slip=0.002, turn=0.01
     )
-    judged = replace(asked, epsilon=0.1, smallest_friction=0.5)
+    judged = replace(asked, margin=(0.1, 0.5))
     missing = replace(trial, outcome=Outcome.MISSING_FINGERTIP, closed=None, lift=None)
     no_contacts = np.full(3, np.nan)
     missed = replace(
         judged,
         outcome=Outcome.MISSING_FINGERTIP,
-        smallest_friction=np.inf,
-        hints=("points in millimetres instead of metres",),
+        margin=(0.1, np.inf),
+        doubts=((Reading(factor=1e-3),), None),
         tries=(some_try(missing, contact_error=no_contacts, normal_error=no_contacts),),
     )
     held = replace(
-        judged,
+        asked_otherwise(judged, normalised=True),
         outcome=Outcome.SUCCESS,
         reason="every fingertip holds it",
         tries=(some_try(trial), some_try(missing)),
-        normalised=True,
     )
-    by_forces = replace(judged, method="forces", outcome=Outcome.SUCCESS, forces=some_forces())
-    return [held, by_forces, missed, invalid]
+    by_forces = replace(judged, outcome=Outcome.SUCCESS, forces=some_forces())
+    return [held, asked_otherwise(by_forces, method="forces"), missed, invalid]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import permutations
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,7 @@ X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1,
 @pytest.fixture(scope="module")
 def cube(tmp_path_factory):
     model = box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3, "1_cube_a")
-    return PlacedObject(model=model, X_TO=standing(model))
+    return PlacedObject(model=model, X_TO=standing(model), config=CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +54,9 @@ def grasp(cube):
 
 
 def verify(placed, p, n, method="hand", config=CONFIG, **how):
+    placed = placed if placed.config is config else replace(placed, config=config)
     (grasp,) = place_on_object(dg.pack_grasp(p, n), placed, method=method, **how)
-    return verify_placed(replace(grasp, config=config))
+    return verify_placed(grasp)
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +72,8 @@ def test_a_grasp_that_held_is_found_again_and_holds(held):
     assert held.closed is not None and held.closed.touching.all()
     assert held.lifted is not None and held.lifted.touching.all()
     assert held.fit.status == 0 and held.fit.iterations > 0
-    assert {"surface", "margin", "fit", "simulate"} <= set(held.seconds)
     assert held.explain().startswith("The grasp of 1_cube_a holds")
+    assert {"surface", "margin", "fit", "simulate"} <= set(held.seconds)
 
 
 def test_forces_alone_hold_it_too(cube, grasp):
@@ -93,13 +93,14 @@ def test_the_same_grasp_gives_the_same_bits(held, cube, grasp):
     np.testing.assert_array_equal(again.trial.lift.X_TO, held.trial.lift.X_TO)
 
 
-@pytest.mark.parametrize("where", ["workspace", "camera"])
+@pytest.mark.parametrize("where", ["table", "camera"])
 def test_moving_object_and_grasp_together_changes_nothing(held, cube, grasp, where):
     Z = make_pose(Rotation.from_euler("z", -2.9).as_matrix(), [0.2, -0.1, 0.0])
     X_TO, seen = Z @ cube.X_TO, where == "camera"
     moved = dg.transform_grasp(invert_pose(X_TC) @ X_TO if seen else X_TO, dg.pack_grasp(*grasp))
     how = {"X_TC": X_TC} if seen else {}
-    (found,) = dg.place_object(cube, X_TO=X_TO).verify(moved, frame=where, **how)
+    placed = replace(dg.place_object(cube, X_TO=X_TO), config=CONFIG)
+    found = dg.verify_grasp(moved, placed, frame=where, **how)
     assert found.outcome is held.outcome and found.num_tries == held.num_tries
     np.testing.assert_allclose(found.fit.X_OG, held.fit.X_OG, atol=1e-9)
     np.testing.assert_allclose(found.closed.p_OQ, held.closed.p_OQ, atol=1e-9)
@@ -157,8 +158,8 @@ def test_start_collision_names_the_links_and_what_they_are_in(cube, grasp):
 @pytest.mark.parametrize(
     ("meant", "given", "factor", "hint"),
     [
-        ("workspace", {"frame": "object"}, 1.0, "the table's frame (table)"),
-        ("object", {"frame": "workspace"}, 1.0, "the object's frame (object)"),
+        ("table", {"frame": "object"}, 1.0, "the table's frame (table)"),
+        ("object", {"frame": "table"}, 1.0, "the object's frame (object)"),
         ("object", {"frame": "camera", "X_TC": X_TC}, 1.0, "the object's frame (object)"),
         (X_TC, {"frame": "camera", "X_TC": invert_pose(X_TC)}, 1.0, "the inverse of X_TC"),
         ("object", {}, 1e3, "points in millimetres instead of metres"),
@@ -166,7 +167,7 @@ def test_start_collision_names_the_links_and_what_they_are_in(cube, grasp):
         ("object", {}, 1e-3, "points 1000 times as large"),
         (X_TC, {"frame": "camera", "X_TC": X_TC}, 1e3, "points in millimetres instead of metres"),
         (
-            "workspace",
+            "table",
             {"frame": "object"},
             1e3,
             "the table's frame (table), with points in millimetres instead of metres",
@@ -185,7 +186,7 @@ def test_misplaced_points_are_told_first_with_where_they_would_fit(
 ) -> None:
     # Of a cube that stands upright in the middle, the frames differ by their height alone.
     X_TO = make_pose(Rotation.from_euler("z", 0.7).as_matrix(), [0.2, -0.1, 0.0]) @ cube.X_TO
-    X_FO = {"object": np.eye(4), "workspace": X_TO}[meant] if isinstance(meant, str) else None
+    X_FO = {"object": np.eye(4), "table": X_TO}[meant] if isinstance(meant, str) else None
     X_FO = invert_pose(X_TC) @ X_TO if X_FO is None else X_FO
     numbers = dg.transform_grasp(X_FO, dg.pack_grasp(*grasp))
     numbers[:9] *= factor
@@ -309,14 +310,16 @@ def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(held, cube, gr
     np.testing.assert_array_equal(again.closed.p_OQ, held.closed.p_OQ)
 
 
-def tried(held, monkeypatch, ends, most=5):
+def tried(held, monkeypatch, ends, most=5, fingers=3):
     """Return the verdict where the trials of the wrist poses end in these ways, in turn."""
     (first,) = held.tries
     trials = iter([replace(first, trial=replace(first.trial, outcome=end)) for end in ends])
     monkeypatch.setattr(verifying, "fit_wrist", lambda *_, **__: [first.fit] * len(ends))
     monkeypatch.setattr(verifying, "_try", lambda *_: next(trials))
-    config = override_config(CONFIG, [f"verify.max_tries={most}"])
-    return verify(held.placed, held.p_OQ, held.nhat_Q_O, config=config)
+    hand = "franka" if fingers == 2 else "barrett"
+    config = override_config(CONFIG, [f"verify.max_tries={most}"], hand=hand)
+    monkeypatch.setattr(verifying, "start_meetings", lambda *_: {})
+    return verify(held.placed, held.p_OQ[:fingers], held.nhat_Q_O[:fingers], config=config)
 
 
 LOST, HITS, HELD = Outcome.SLIPPED, Outcome.START_COLLISION, Outcome.SUCCESS
@@ -345,34 +348,19 @@ def test_first_wrist_pose_decides_and_the_others_are_an_oracle(
         assert f"number {by + 1} of {tries} does" in found.explain()
 
 
-def test_two_contacts_leave_poses_that_collide_out(held, monkeypatch):
+@pytest.mark.parametrize(
+    ("fingers", "ends", "left"),
+    [
+        (2, [HITS] * 9 + [LOST, HITS, HELD, LOST], [LOST, HELD]),
+        (2, [HITS] * 3, [HITS]),
+        (3, [HITS, HITS, HELD], [HITS, HITS, HELD]),
+    ],
+)
+def test_two_contacts_leave_poses_that_collide_out(held, monkeypatch, fingers, ends, left):
     """The palm's turn about two contacts is open: the first pose that is clear is the first."""
-    (first,) = held.tries
-
-    def run(ends):
-        trials = iter([replace(first, trial=replace(first.trial, outcome=end)) for end in ends])
-        monkeypatch.setattr(verifying, "_try", lambda *_: next(trials))
-        fits = [first.fit] * len(ends)
-        tries = verifying._try_poses(held, fits, pass_collisions=True)
-        return tuple(each.trial.outcome for each in tries)
-
-    assert run([HITS] * 9 + [LOST, HITS, HELD, LOST]) == (LOST, HELD)
-    assert run([HITS] * 3) == (HITS,)
-
-
-@pytest.mark.parametrize(("fingers", "passed"), [(2, True), (3, False), (4, False)])
-def test_poses_that_collide_are_left_out_of_two_fingers_alone(held, monkeypatch, fingers, passed):
-    said = []
-
-    def tries(base, fits, *, pass_collisions):
-        said.append(pass_collisions)
-        return base.tries
-
-    monkeypatch.setattr(verifying, "load_hand", lambda _: SimpleNamespace(num_fingers=fingers))
-    monkeypatch.setattr(verifying, "_fits", lambda *_: [])
-    monkeypatch.setattr(verifying, "_try_poses", tries)
-    assert verifying._lift_by_hand(held).outcome is held.outcome
-    assert said == [passed]
+    found = tried(held, monkeypatch, ends, fingers=fingers)
+    assert [each.trial.outcome for each in found.tries] == left
+    assert found.outcome is left[0]
 
 
 def test_number_of_threads_changes_no_bit(cube, grasp):
@@ -436,7 +424,7 @@ def test_fingers_are_opened_until_the_hand_is_clear(held, cube, monkeypatch, col
 
     monkeypatch.setattr(verifying, "run_attempt", run)
     config = override_config(CONFIG, ["verify.open_margin_deg=10"])
-    pregrasp, trial = verifying._run(cube, cube.X_TO, held.fit, config)
+    pregrasp, trial = verifying._run(cube, held.fit, config)
     expected = [held.fit.closing - share * np.deg2rad(10.0) for share in shares]
     np.testing.assert_allclose(opened, np.maximum(expected, 0.0), atol=1e-12)
     assert trial.outcome is (Outcome.START_COLLISION if collisions == 2 else Outcome.SUCCESS)

@@ -139,17 +139,6 @@ def test_slope_of_each_term_is_that_of_finite_differences(name, term):
     np.testing.assert_allclose(own, slope, atol=1e-6 * np.abs(slope).max(), rtol=1e-5)
 
 
-@pytest.mark.parametrize("seed", SEEDS[:4])
-def test_rows_of_scalars_are_plain_derivatives(name, seed):
-    problem, x = random_problem(name, seed)
-    hand = hand_of(name)
-    for term in ("distance", "posture", "pad"):
-        rows = terms(hand)[term]
-        slope = differences(lambda x, rows=rows: evaluate(problem, x).residuals[rows], x)  # type: ignore[misc]
-        at = evaluate(problem, x)
-        np.testing.assert_allclose(at.jacobian[rows], slope, atol=1e-7)
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name, seed):
     problem, x = random_problem(name, seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations, permutations
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -187,25 +187,6 @@ def test_joints_stay_within_their_limits(pincer, seed):
 
 
 @pytest.mark.parametrize("seed", few(SEEDS[:8]))
-def test_where_the_object_is_does_not_matter(seed):
-    rng, made = np.random.default_rng(1000 + seed), touched("barrett", seed)
-    X_AO = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
-    up_O = X_AO[:3, :3].T @ UP
-    here = fit("barrett", made, up_O, HIGH)
-    there = fit_wrist(
-        hand_of("barrett"),
-        transform_points(X_AO, made.p_OQ),
-        rotate_vectors(X_AO, made.nhat_Q_O),
-        up_O=UP,
-        height=HIGH - X_AO[2, 3],
-    )
-    assert len(there) == len(here)
-    assert there[0].objective == pytest.approx(here[0].objective, rel=1e-2)
-    np.testing.assert_allclose(coordinates(there[0]), coordinates(here[0]), atol=1e-3)
-    np.testing.assert_allclose(there[0].X_OG, X_AO @ here[0].X_OG, atol=1e-3)
-
-
-@pytest.mark.parametrize("seed", few(SEEDS[:8]))
 def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed):
     """Fingers 1 and 2 are mirror images in the palm's plane x = 0, finger 3 is its own."""
     made, mirror, swapped = touched("barrett", seed), np.diag([-1.0, 1.0, 1.0]), [1, 0, 2]
@@ -220,17 +201,6 @@ def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed):
     assert image.objective == pytest.approx(best.objective, rel=1e-2)
     np.testing.assert_allclose(image.closing, best.closing[swapped], atol=1e-3)
     assert image.spread == pytest.approx(best.spread, abs=1e-3)
-
-
-@pytest.mark.parametrize("seed", few(SEEDS[:5]))
-def test_contacts_given_to_other_fingers_fit_worse(seed):
-    """Often not by much: three points on three large pads leave a lot open."""
-    made = touched("barrett", seed, scatter=0.0, closing_deg=(40, 100))
-    own = fit("barrett", made)[0].objective
-    for order in list(permutations(range(3)))[1:]:
-        p, n = made.p_OQ[list(order)], made.nhat_Q_O[list(order)]
-        other = fit_wrist(hand_of("barrett"), p, n, up_O=UP, height=HIGH)[0]
-        assert other.objective > own
 
 
 def above(made, room):
