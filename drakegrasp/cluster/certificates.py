@@ -65,6 +65,24 @@ def security_of(files: tuple[Path, Path, Path]) -> Security:
 
 
 @contextmanager
+def made_or_given(
+    tls: bool, files: tuple[Path, Path, Path] | None, out: Path
+) -> Iterator[Security | None]:
+    """Yield the certificates that a caller gives, or new ones that are removed afterwards.
+
+    Args:
+        tls: Whether connections need a certificate; if not, None is yielded.
+        files: Authority, certificate and private key; None for new ones.
+        out: Directory for new ones, which all machines see; see `private_directory`.
+    """
+    if tls and files is None:
+        with private_directory(out) as folder:
+            yield security_of(make_certificates(folder))
+    else:
+        yield chosen_security(tls, files, elsewhere=True)
+
+
+@contextmanager
 def private_directory(out: Path) -> Iterator[Path]:
     """Yield a directory in `out` that only this user can enter, and remove it afterwards.
 
@@ -86,12 +104,3 @@ def private_directory(out: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # removes only an empty directory, in which nothing was built
             out.rmdir()
-
-
-def server_options(security: Security | None) -> dict[str, Any]:
-    """Return the options of a Dask server on another machine, as JSON types."""
-    if security is None:
-        return {}
-    names = ("ca_file", "scheduler_cert", "scheduler_key", "worker_cert", "worker_key")
-    files = {f"tls_{name}": getattr(security, f"tls_{name}") for name in names}
-    return {"protocol": "tls://", "security": {"require_encryption": True, **files}}
