@@ -48,9 +48,11 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from filelock import lock_descriptor
+
 from drakegrasp.errors import BlankImageError
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
-from drakegrasp.runtime.files import lock_file, temporary_name
+from drakegrasp.runtime.files import temporary_name
 
 #: Number of successive crashes in one step after which the step is not tried again: one crash may
 #: be the machine's fault.
@@ -253,7 +255,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     try:
         temporary.write_bytes(line + b"\n" + _record(_START, 0))
         with temporary.open("r+b", buffering=0) as file:
-            lock_file(file)
+            _lock(file.fileno())
             file.seek(0, os.SEEK_END)  # faulthandler writes here
             temporary.replace(path)
             with _crashes_marked(file):
@@ -267,6 +269,14 @@ def _record(step: str, passed: int) -> bytes:
     return f"{passed:016x} {step}".encode("ascii").ljust(_RECORD_SIZE - 1) + b"\n"
 
 
+def _lock(descriptor: int) -> bool:
+    """Take the kernel's lock on a journal; return whether no other process has it."""
+    try:
+        return lock_descriptor(descriptor, blocking=False)
+    except OSError:
+        return True  # on a file system without locks, nobody is known to hold one
+
+
 def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     """Return how earlier runs died, or None if one of them is still running."""
     history = _History()
@@ -275,8 +285,7 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     try:
         refuse_irregular(path, LARGEST_TEXT)
         with path.open("r+b") as file:  # NFS locks only files that are open for writing
-            # On a file system without locks (None), nobody is known to hold a lock.
-            if lock_file(file) is False:
+            if not _lock(file.fileno()):
                 return None
             head, _, rest = file.read().partition(b"\n")
         content = json.loads(head)
