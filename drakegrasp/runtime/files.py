@@ -21,7 +21,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from io import BufferedRandom, BufferedReader, BytesIO, FileIO
+from io import BufferedRandom, BufferedReader, FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,22 +108,13 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
 
     Args:
         path: Path of the file.
-        sealed: Whether to reserve room for a seal and set it, see `seal`. Such a file is built in
-            memory; for one that may be larger, see `new_hdf5`.
+        sealed: Whether to set a seal, see `seal`.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
     """
-    with atomic_path(path) as temporary:
-        if sealed:
-            content = BytesIO()
-            with h5py.File(content, "w", userblock_size=SEAL_SIZE, libver=FORMAT) as file:
-                yield file
-            temporary.write_bytes(content.getbuffer())
-            seal(temporary)
-        else:
-            with new_hdf5(temporary) as file:
-                yield file
+    with atomic_path(path) as temporary, new_hdf5(temporary, sealed=sealed) as file:
+        yield file
 
 
 @contextmanager

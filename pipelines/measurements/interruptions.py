@@ -8,7 +8,7 @@
 becomes full at a different moment each time: each must end with exit code 1 and one line, and keep
 the previous files. `kills` ends the client of a build with SIGKILL at random moments, in each round
 twice while it prepares, twice while it simulates and twice while it assembles: the files must be of
-one state or be told to be of two, and no temporary file may be left at the end. Both print a line of
+one state, or be told not to be, and no temporary file may be left at the end. Both print a line of
 JSON for each interruption; the exit code is 1 if any is wrong.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
