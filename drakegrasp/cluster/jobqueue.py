@@ -151,13 +151,17 @@ class Jobs(Local):
         )
 
         async def submit() -> None:
-            cluster.scale(jobs=self.jobs)
-            await cluster  # raises the error of the scheduler's command
+            # Not `scale`, which submits later and logs the error of the scheduler's command.
+            for _ in range(self.jobs):
+                cluster.worker_spec.update(cluster.new_worker_spec())
+            await cluster
             PeriodicCallback(_Refill(cluster, self.jobs), 1000.0 * REFILL_SECONDS).start()
 
         try:
             cluster.sync(submit)
         except BaseException:
+            for job in cluster.workers.values():
+                job.status = Status.failed  # or Dask would not close the cluster
             cluster.close()
             raise
         return cluster

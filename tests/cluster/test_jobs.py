@@ -79,7 +79,7 @@ def typed(option: click.Option, text: str, folder: Path) -> str:
         path.mkdir()
         trimesh.creation.box([0.06, 0.06, 0.06]).export(path / "1_box_a.obj")
     elif not isinstance(option.type, click.Path):
-        return f"project={text}" if option.opts[0] == "--with" else text
+        return f"queue={text}" if option.opts[0] == "--with" else text
     elif option.type.exists:
         path.write_text("{}")
     return str(path)
