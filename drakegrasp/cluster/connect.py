@@ -9,7 +9,6 @@ are not started.
 from __future__ import annotations
 
 import importlib.util
-import json
 import logging
 import multiprocessing
 import os
@@ -30,6 +29,7 @@ from tornado.ioloop import IOLoop
 
 from drakegrasp.cluster.certificates import chosen_security
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.foreign_files import read_json
 from drakegrasp.generation.prepare import PREPARE_SECONDS
 from drakegrasp.runtime.executor import count_workers, refuse_to_start_workers
 from drakegrasp.runtime.journal import wall_limit
@@ -217,7 +217,7 @@ def _address_in(file: Path) -> str:
     end = monotonic() + WRITE_SECONDS
     while True:
         try:
-            return str(json.loads(file.read_text(encoding="utf-8"))["address"])
+            return str(read_json(file)["address"])
         except (OSError, ValueError, LookupError, TypeError):
             if monotonic() > end:
                 raise MachineError(

@@ -18,7 +18,7 @@ import shlex
 import sys
 import types
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -84,15 +84,16 @@ class Jobs(Local):
         memory = self.memory or (None if self._site("memory") else WORKER_MEMORY)
         total = None if memory is None else f"{self.per_job * memory_bytes(memory)}B"
         prologue, arguments = self._site("job-script-prologue"), self._site("worker-extra-args")
-        given = {"memory": total, "walltime": self.walltime, "interface": self.interface}
         return {
             "cores": self.per_job,
             "processes": self.per_job,
+            "memory": total,
+            "interface": self.interface,
             "security": security,
             # Every user of the worker's machine could read an open port.
             "worker_extra_args": [*(arguments or ()), f"--dashboard-address={LOOPBACK}:0"],
             "job_script_prologue": [*(prologue or ()), *_exports()],
-            **{key: value for key, value in given.items() if value is not None},
+            **({} if self.walltime is None else {"walltime": self.walltime}),
             **{key: _value(text) for key, text in self.own.items()},
         }
 
@@ -117,12 +118,9 @@ class Jobs(Local):
         """Return the command that submits a script."""
         return str(self.of.job_cls.submit_command)
 
-    def connected(self, out: Path) -> AbstractContextManager[Client]:
-        """Return a context manager that submits the jobs and yields a client."""
-        return self._running(out)
-
     @contextmanager
-    def _running(self, out: Path) -> Iterator[Client]:
+    def connected(self, out: Path) -> Iterator[Client]:
+        """Submit the jobs, and yield a client; the jobs end with the block."""
         with (
             made_or_given(self.tls, self.tls_files, out) as security,
             dask.config.set(dask_settings()),

@@ -18,43 +18,36 @@ from helpers.golden import Golden
 from helpers.tiers import few
 
 from drakegrasp.cli.submit import submit
-from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import dask_settings
 from drakegrasp.cluster.kinds import cluster_of, describe
 from drakegrasp.errors import ConfigError, MachineError
 
 pytest.importorskip("dask_jobqueue")
 
-from dask_jobqueue.slurm import SLURMJob
 
-from drakegrasp.cluster.jobqueue import quoted
-
-
-def test_paths_in_a_job_script_are_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_job_runs_a_worker_with_its_paths_and_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Paths are words, whatever characters they have, and a job inherits no settings."""
     folder = tmp_path / "a b $(touch ran) 'c' \"d\" `touch ran`"
     folder.mkdir()
     python = folder / "python"
     python.write_text(
-        f"#!{sys.executable}\nimport json, sys\n"
-        f"json.dump(sys.argv[1:], open({str(tmp_path / 'words')!r}, 'w'))\n"
+        f"#!{sys.executable}\nimport json, os, sys\n"
+        f"json.dump([sys.argv[1:], dict(os.environ)], open({str(tmp_path / 'told')!r}, 'w'))\n"
     )
     python.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(python))
     files = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
-    script = quoted(SLURMJob)(
-        "tls://10.0.0.1:8786",
-        "worker",
-        cores=1,
-        memory="1GB",
-        worker_extra_args=["--lifetime", "60s"],
-        security=security_of(files),
-    ).job_script()
+    script = cluster_of("slurm", workers=1, tls_files=files).script(tmp_path)
     subprocess.run(["bash", "-c", script], cwd=tmp_path, check=True, timeout=120)
-    words = json.loads((tmp_path / "words").read_text())
+    words, environment = json.loads((tmp_path / "told").read_text())
     said = dict(pairwise(words))
     assert [said[f"--tls-{key}"] for key in ("ca-file", "cert", "key")] == list(map(str, files))
-    assert said["--lifetime"] == "60s"
     assert not list(tmp_path.rglob("ran"))
+    found = dask.config.collect_env({k: v for k, v in environment.items() if k[:5] == "DASK_"})
+    for key, wanted in dask_settings().items():
+        assert dask.config.get(key, config=found) == wanted, key
 
 
 #: Texts of which a shell runs a part, unless they are quoted.

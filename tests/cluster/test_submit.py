@@ -30,8 +30,7 @@ from drakegrasp import registry
 from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import make_certificates, private_directory
-from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, dask_settings
-from drakegrasp.cluster.jobqueue import _exports
+from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect
 from drakegrasp.cluster.kinds import Local, cluster_of
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.generation.pipeline import build
@@ -159,18 +158,6 @@ def test_kind_of_another_package_has_settings_of_its_own(monkeypatch: pytest.Mon
         assert f"must be KEY=VALUE with KEY one of image for --cluster pods, got {text!r}" in str(
             told.value
         )
-
-
-def test_settings_survive_a_job_script() -> None:
-    """A shell that runs the lines of the script gives Dask the same settings."""
-    probe = f"import dask, json; print([dask.config.get(k) for k in {list(dask_settings())!r}])"
-    script = "\n".join([*_exports(), f"exec '{sys.executable}' -c \"$0\""])
-    result = subprocess.run(
-        ["bash", "-c", script, probe], capture_output=True, text=True, env={}, check=True
-    )
-    found = ast.literal_eval(result.stdout)
-    for (key, wanted), got in zip(dask_settings().items(), found, strict=True):
-        assert (got | wanted if isinstance(wanted, dict) else wanted) == got, key
 
 
 def test_keys_are_private_and_removed(tmp_path: Path) -> None:
