@@ -1,7 +1,7 @@
 """Workers in jobs of a batch scheduler, by dask-jobqueue; needs the extra `[jobqueue]`.
 
-Each kind is a class of dask-jobqueue by its name. The scheduler's own options are settings of the
-kind, and jobqueue.yaml of the user states everything else. What is added here: connections need a
+A kind is a class of dask-jobqueue, whose options are its settings; jobqueue.yaml of the user states
+everything else. What is added here: connections need a
 certificate, a worker is a process of one thread with Dask's settings of this program, and a lost
 job is replaced.
 
@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import dask
-import dask_jobqueue
 from distributed import Client, SpecCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
@@ -165,40 +164,10 @@ class Jobs(Local):
         return cluster
 
 
-class Slurm(Jobs):
-    """SLURM."""
-
-    of = dask_jobqueue.SLURMCluster
-
-
-class Pbs(Jobs):
-    """PBS."""
-
-    of = dask_jobqueue.PBSCluster
-
-
-class Lsf(Jobs):
-    """LSF."""
-
-    of = dask_jobqueue.LSFCluster
-
-
-class Sge(Jobs):
-    """Grid Engine."""
-
-    of = dask_jobqueue.SGECluster
-
-
-class Htcondor(Jobs):
-    """HTCondor."""
-
-    of = dask_jobqueue.HTCondorCluster
-
-
-class Oar(Jobs):
-    """OAR."""
-
-    of = dask_jobqueue.OARCluster
+def jobs_of(cluster: type[Any]) -> type[Jobs]:
+    """Return the kind whose jobs are those of a class of dask-jobqueue."""
+    kind: type[Jobs] = type(cluster.__name__, (Jobs,), {"of": cluster})
+    return kind
 
 
 def _value(text: str) -> Any:

@@ -1,9 +1,8 @@
 """Kinds of clusters by name, as `drakegrasp submit --cluster` takes them.
 
 Input: the options of a kind. Output: lines for the user, and a Dask client while a block runs. A
-kind is a class and a line in pyproject.toml; this module has workers on this machine, the base of
-all kinds, and those of a running scheduler. For every other cluster start its workers yourself, and
-pass a client to the call (`client=`).
+kind is a line in pyproject.toml, with a class of dask-jobqueue or a subclass of `Local`. For every
+other cluster start its workers yourself, and pass a client to the call (`client=`).
 """
 
 from __future__ import annotations
@@ -149,6 +148,10 @@ def cluster_of(kind: str, own: Sequence[str] = (), **options: Any) -> Local:
         MachineError: If a package is missing.
     """
     found = registry.find("clusters", kind)
+    if hasattr(found, "job_cls"):  # of dask-jobqueue, which may not be installed
+        from drakegrasp.cluster.jobqueue import jobs_of
+
+        found = jobs_of(found)
     if not (isinstance(found, type) and issubclass(found, Local)):
         raise ConfigError(f"clusters: {kind} must be a subclass of Local, got {found!r}")
     given = {}

@@ -29,8 +29,9 @@ import drakegrasp
 from drakegrasp import registry
 from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.certificates import make_certificates, private_directory
+from drakegrasp.cluster.certificates import made_or_given, make_certificates
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect
+from drakegrasp.cluster.jobqueue import Jobs
 from drakegrasp.cluster.kinds import Local, cluster_of
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.generation.pipeline import build
@@ -108,7 +109,7 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
             assert security.tls_ca_file == str(kept)
         raise MachineError("started")
 
-    monkeypatch.setattr(registry.find("clusters", "slurm"), "_start", start)
+    monkeypatch.setattr(Jobs, "_start", start)
     cluster = cluster_of("slurm", workers=1, tls=choice != "none", tls_files=own)
     with pytest.raises(MachineError, match="started"), cluster.connected(tmp_path / "out"):
         pass
@@ -161,16 +162,16 @@ def test_kind_of_another_package_has_settings_of_its_own(monkeypatch: pytest.Mon
 
 
 def test_keys_are_private_and_removed(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    dead = out / ".tls-dead"  # of a client that was killed
-    dead.mkdir(parents=True)
+    dead = tmp_path / ".tls-dead"  # of a client that was killed
+    dead.mkdir()
     make_certificates(dead)
-    with private_directory(out) as folder:
-        assert list(out.iterdir()) == [folder]
-        files = make_certificates(folder)
+    with made_or_given(True, None, tmp_path) as security:
+        assert security is not None
+        (folder,) = tmp_path.iterdir()
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-        assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
-    assert not out.exists()
+        assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
+        assert security.tls_ca_file == str(folder / "ca.pem")
+    assert not list(tmp_path.iterdir())
 
 
 def test_script_makes_certificates_in_a_new_folder_of_its_own(tmp_path: Path) -> None:
