@@ -89,11 +89,11 @@ test-torch: $(DEV)  ## the baseline and the loaders for torch, which it installs
 	$(BIN)/python -m pip install --quiet --editable '.[torch]'
 	DRAKEGRASP_TORCH=1 $(BIN)/python -m pytest tests/test_baseline.py tests/dataset/test_torch_samples.py
 
-test-cluster: $(DEV)  ## with a real SLURM and a real sshd, which it installs; as root, on Debian
+test-cluster: $(DEV)  ## with a real SLURM, which it installs; as root, on Debian
 	apt-get update -qq
 	DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
-	    slurm-wlm munge openssh-server openssh-client
-	$(BIN)/python -m pip install --quiet --editable '.[dev,slurm,ssh]'
+	    slurm-wlm munge
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	$(BIN)/python -m pytest -m server
 
 lint: $(DEV)   ## style, types, and docs that are made from code

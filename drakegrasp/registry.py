@@ -5,7 +5,7 @@ entry points are in pyproject.toml like those of any other package, and are load
 one needs one module and one line. In a checkout, pyproject.toml itself is read, so that a new line
 works without a new installation.
 
-clusters: a subclass of `cluster.kinds.Local`.
+clusters: a subclass of `cluster.kinds.Local`, or a class of dask-jobqueue.
 exporters: a function (dataset, folder, progress) that returns the number of samples.
 hands: the path of a hand file.
 importers: a function (path, hand) that returns arguments of `simulation.attempts.make_attempts`, or

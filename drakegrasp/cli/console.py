@@ -29,7 +29,6 @@ from drakegrasp.errors import (
     first_line,
     printable,
 )
-from drakegrasp.runtime.allocator import restart
 
 if TYPE_CHECKING:
     from drakegrasp.runtime.progress import Report
@@ -201,4 +200,5 @@ def restart_with_utf8() -> None:
     if sys.getfilesystemencoding() == "utf-8" or os.environ.get(_UTF8) == "1":
         return
     terminal = getattr(sys.stdout, "encoding", None) or "utf-8"
-    restart({_STREAMS: f"{terminal}:replace", **os.environ, _UTF8: "1"})
+    environment = {_STREAMS: f"{terminal}:replace", **os.environ, _UTF8: "1"}
+    os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)

@@ -31,7 +31,6 @@ FAST_DRAKE, FAST_PYTHON = (1, 58, 0), (3, 12)
 DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
 EGL_LIBRARY = "libEGL.so.1"
 EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
-JEMALLOC_PACKAGE = "apt-get install libjemalloc2"
 #: Space for about 3,500 successes: two images of 128 x 128 pixels of 17 bytes, uncompressed [B].
 FREE_BYTES = 2e9
 #: Memory of a worker, which keeps the scenes of a few objects [B].
@@ -73,7 +72,6 @@ def diagnose(directory: Path | None = None) -> list[Finding]:
         check_python(),
         check_glibc(),
         check_drake(),
-        check_allocator(),
         check_egl(),
         check_image(),
         check_writing(place),
@@ -118,16 +116,6 @@ def check_drake() -> Finding:
         newer = f"{_dotted(FAST_DRAKE)} on Python {_dotted(FAST_PYTHON)} or newer"
         what += f": works; attempts take up to a tenth longer than with {newer}"
     return _finding("Drake", ok, what, f"pip install '{DRAKE_REQUIREMENT}'")
-
-
-def check_allocator() -> Finding:
-    """Return the allocator of the workers; any allocator works, but jemalloc is the fastest."""
-    from drakegrasp.runtime.allocator import LIBRARY, allocator, jemalloc_environment
-
-    if jemalloc_environment():
-        return Finding(name="allocator", ok=True, what=f"{LIBRARY} for workers and verify")
-    what = f"{allocator()}: works; with jemalloc a build is a tenth faster: {JEMALLOC_PACKAGE}"
-    return Finding(name="allocator", ok=True, what=what)
 
 
 def check_egl() -> Finding:

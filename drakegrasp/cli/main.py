@@ -31,7 +31,6 @@ from drakegrasp.cli.predict import predict
 from drakegrasp.cli.predictions import score, verify
 from drakegrasp.cli.submit import submit
 from drakegrasp.cli.views import export, figures, inspect_
-from drakegrasp.runtime.allocator import restart_with_jemalloc
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -69,7 +68,7 @@ for _command in (
 
 
 def run() -> None:
-    """Run the program; commands that may simulate in this process do so with jemalloc."""
+    """Run the program."""
     # Click drops what is printed to a closed stream, and a file that is opened may get its number.
     if sys.stdout is None:
         sys.exit("error: standard output must be open, got a closed one")
@@ -78,6 +77,4 @@ def run() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    if sys.argv[1:2] in (["verify"], ["score"], ["hand"]):
-        restart_with_jemalloc()
     main()

@@ -20,13 +20,10 @@ if TYPE_CHECKING:
 
 @click.command(cls=OneCommand, context_settings={"help_option_names": ["-h", "--help"]})
 @described
-@click.option("--address", hidden=True, help="An older name of --scheduler.")
-@click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
 def submit(
-    where: tuple[str, ...],
-    address: str | None,
     kind: Annotated[str, Named("clusters")] = "local",
     scheduler: str | None = None,
+    scheduler_file: Path | None = None,
     workers: int | None = None,
     cores: int | None = None,
     memory: str | None = None,
@@ -42,7 +39,6 @@ def submit(
 
     \b
         drakegrasp submit --cluster local OPTIONS
-        drakegrasp submit --cluster ssh a b --cores 16 --interface eth0 OPTIONS
         drakegrasp submit --cluster slurm --workers 200 --interface ib0 OPTIONS
         drakegrasp submit --scheduler tls://10.0.0.1:8786 OPTIONS
 
@@ -51,44 +47,40 @@ def submit(
     example of each.
 
     Options:
-        --cluster KIND (kind): Where the work runs: local, ssh, slurm, pbs, lsf, sge, htcondor, oar,
-            scheduler, scheduler-file, or a kind of another package. Hosts follow ssh, an address
-            follows scheduler, and a path follows scheduler-file.
+        --cluster KIND (kind): Where the work runs: local, slurm, pbs, lsf, sge, htcondor, oar, or a
+            kind of another package.
         --scheduler ADDRESS: In place of --cluster: use the running Dask scheduler at this address.
+        --scheduler-file FILE: In place of --cluster: use the running Dask scheduler that wrote this
+            file.
         BUILD
         --workers N: Total number of processes. [default with local: one per core]
-        --cores N: Number of cores of each SSH host or job, with a worker on each core.
+        --cores N: Number of cores of each job, with a worker on each core.
         --memory SIZE: Memory of each worker, e.g. 2GB.
-        --walltime TIME: Time limit of each job, [D-]HH:MM:SS.
+        --walltime TIME: Time limit of each job, as the batch scheduler writes it.
         --interface NAME: Network interface on which scheduler and workers listen.
         --host ADDRESS: In place of --interface: address on which the scheduler listens.
-        --with KEY=VALUE (own): A setting that only this kind of cluster has, as one of another
-            package may; may be given several times.
+        --with KEY=VALUE (own): A setting that only this kind of cluster has, e.g. queue=long; may
+            be given several times.
         TLS
         --dry-run: Only print which workers would run, the amount of work that is known before the
             build, and the script of a job.
         --script FILE: Only write the script of a job.
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.api.building import build_on, find_sources, known_work
-    from drakegrasp.cluster.kinds import AddressMissingError, cluster_of, describe, present
+    from drakegrasp.cluster.kinds import Running, cluster_of, describe, present
     from drakegrasp.exchange.attempts import read_attempts
     from drakegrasp.hand.description import load_hand
 
-    if (running_at := scheduler or address) is not None:
-        if kind != "local" or where:
-            raise click.UsageError("--scheduler must be used without --cluster")
-        kind, where = "scheduler", (running_at,)
-    given = dict(workers=workers, cores=cores, memory=memory, walltime=walltime)
+    given: dict[str, Any] = dict(workers=workers, cores=cores, memory=memory, walltime=walltime)
     given |= dict(interface=interface, host=host)
     tls = chosen_tls(options)
     request = parse_request(options)
-    try:
-        cluster = cluster_of(kind, own, where=where, **given, **tls)
-    except AddressMissingError as error:
-        if not dry_run:
-            raise
-        cluster = cluster_of(kind, own, where=where, **given | {"interface": "NAME"}, **tls)
-        say(f"note: {error}")
+    if scheduler is not None or scheduler_file is not None:
+        if kind != "local":
+            raise click.UsageError("--scheduler must be used without --cluster")
+        cluster: Local = Running(address=scheduler, file=scheduler_file, **given, **tls)
+    else:
+        cluster = cluster_of(kind, own, **given, **tls)
 
     # Print what will run before anything starts.
     say("\n".join(describe(cluster)))

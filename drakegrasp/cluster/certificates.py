@@ -7,15 +7,15 @@ processes on other machines are files that only this user can read.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from distributed.security import Security
 
-from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.errors import ConfigError
 
 
 def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
@@ -65,33 +65,23 @@ def security_of(files: tuple[Path, Path, Path]) -> Security:
 
 
 @contextmanager
-def private_directory(out: Path) -> Iterator[Path]:
-    """Yield a directory in `out` that only this user can enter, and remove it afterwards.
+def made_or_given(
+    tls: bool, files: tuple[Path, Path, Path] | None, out: Path
+) -> Iterator[Security | None]:
+    """Yield the certificates that a caller gives, or new ones that are removed afterwards.
 
-    Directories of killed clients are also removed, because the caller holds the lock of `out`.
-
-    Raises:
-        MachineError: If the directory cannot be created.
+    Args:
+        tls: Whether connections need a certificate; if not, None is yielded.
+        files: Authority, certificate and private key; None for new ones.
+        out: Directory that all machines see, for new ones. Those of killed clients are removed,
+            because the caller holds the lock of the directory.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for leftover in out.glob(".tls-*"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        folder = Path(tempfile.mkdtemp(prefix=".tls-", dir=out))  # mode 0700
-    except OSError as error:
-        raise MachineError(f"{out}: must be a directory that can be written: {error}") from None
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        with suppress(OSError):  # removes only an empty directory, in which nothing was built
-            out.rmdir()
-
-
-def server_options(security: Security | None) -> dict[str, Any]:
-    """Return the options of a Dask server on another machine, as JSON types."""
-    if security is None:
-        return {}
-    names = ("ca_file", "scheduler_cert", "scheduler_key", "worker_cert", "worker_key")
-    files = {f"tls_{name}": getattr(security, f"tls_{name}") for name in names}
-    return {"protocol": "tls://", "security": {"require_encryption": True, **files}}
+    given = chosen_security(tls, files, elsewhere=True)
+    if given is not None or not tls:
+        yield given
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    for leftover in out.glob(".tls-*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+    with TemporaryDirectory(prefix=".tls-", dir=out) as folder:  # only this user can enter it
+        yield security_of(make_certificates(Path(folder)))

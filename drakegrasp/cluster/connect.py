@@ -9,13 +9,12 @@ are not started.
 from __future__ import annotations
 
 import importlib.util
-import json
 import logging
 import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -30,8 +29,8 @@ from tornado.ioloop import IOLoop
 
 from drakegrasp.cluster.certificates import chosen_security
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.foreign_files import read_json
 from drakegrasp.generation.prepare import PREPARE_SECONDS
-from drakegrasp.runtime.allocator import PRELOAD, SETTINGS, kept_variables
 from drakegrasp.runtime.executor import count_workers, refuse_to_start_workers
 from drakegrasp.runtime.journal import wall_limit
 
@@ -39,8 +38,6 @@ from drakegrasp.runtime.journal import wall_limit
 LOOPBACK = "127.0.0.1"
 #: How long to wait for a scheduler to answer, and how long it may take to write its file [s].
 CONNECT_SECONDS, WRITE_SECONDS = 10, 2
-#: Module that a nanny loads before it starts its worker, to choose the allocator of the worker.
-NANNY_PRELOAD = "drakegrasp.runtime.allocator"
 #: Number of tasks that the scheduler sends to a worker per thread. If a running task kills the
 #: worker, Dask would also blame a task that waits behind it.
 SATURATION = 1.0
@@ -97,7 +94,6 @@ def dask_settings() -> dict[str, Any]:
         "distributed.scheduler.worker-saturation": SATURATION,
         "distributed.scheduler.worker-ttl": f"{SILENCE_SECONDS:g}s",
         "distributed.nanny.pre-spawn-environ": start_environment(),
-        "distributed.nanny.preload": [NANNY_PRELOAD],
         # On a busy machine a worker restarts slowly, and Dask would close its nanny.
         "distributed.deploy.lost-worker-timeout": "60 s",
         "distributed.worker.memory.target": False,
@@ -105,19 +101,6 @@ def dask_settings() -> dict[str, Any]:
         # A paused worker has no other task that could free memory, so it would wait forever.
         "distributed.worker.memory.pause": False,
     }
-
-
-def dask_variables(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Return Dask settings as environment variables, for a process that inherits no settings."""
-    return {
-        "DASK_" + key.upper().replace(".", "__").replace("-", "_"): _literal(value)
-        for key, value in settings.items()
-    }
-
-
-def _literal(value: Any) -> str:
-    """Return a value as a Python literal; texts in double quotes, which shell scripts can quote."""
-    return json.dumps(value) if isinstance(value, str | list | dict) else repr(value)
 
 
 def dashboard_line(client: Client) -> str:
@@ -177,10 +160,10 @@ def connect(
 
     @contextmanager
     def connected() -> Iterator[Client]:
-        # Dask sets variables here for the workers that it starts here.
-        with kept_variables(PRELOAD, SETTINGS), dask.config.set(dask_settings()):
+        with dask.config.set(dask_settings()):
             if elsewhere:
-                cluster = _connect_remote(scheduler, scheduler_file, security, tls)
+                address = scheduler or _address_in(Path(str(scheduler_file)))
+                cluster = _connect_remote(address, security, tls)
             else:
                 cluster = _start_local(count, security, memory or "auto")
             with cluster as client:
@@ -215,47 +198,32 @@ def refuse_open(address: str, tls: bool) -> None:
         )
 
 
-def _connect_remote(
-    scheduler: str | None, scheduler_file: str | Path | None, security: Security | None, tls: bool
-) -> Client:
-    address, file = scheduler, None if scheduler_file is None else str(scheduler_file)
-    # Dask would wait forever for a missing file.
-    if file is not None and not scheduler:
-        if not Path(file).is_file():
-            raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
-        address = _address_of(Path(file))
-        if address is None:
-            raise MachineError(f"{file}: must be the file of a running Dask scheduler, got another")
-    refuse_open(str(address), tls)
+def _connect_remote(address: str, security: Security | None, tls: bool) -> Client:
+    refuse_open(address, tls)
     try:
-        return _RemoteClient(
-            scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
-        )
+        return _RemoteClient(address, timeout=CONNECT_SECONDS, security=security)
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         raise MachineError(
-            f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
+            f"{address}: must be a running Dask scheduler, got none ({error})"
         ) from None
 
 
-def _address_of(file: Path) -> str | None:
-    """Return the address in a scheduler's file; None if the file has no address.
+def _address_in(file: Path) -> str:
+    """Return the address in a scheduler's file, which may be about to be written.
 
-    A starting scheduler creates its file before it writes the content, so an incomplete file is
-    read again for `WRITE_SECONDS`.
+    Raises:
+        MachineError: If the file has no address after `WRITE_SECONDS`.
     """
     end = monotonic() + WRITE_SECONDS
     while True:
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
-        except OSError:
-            return None
-        except ValueError:
+            return str(read_json(file)["address"])
+        except (OSError, ValueError, LookupError, TypeError):
             if monotonic() > end:
-                return None
-            sleep(0.05)
-        else:
-            address = content.get("address") if isinstance(content, dict) else None
-            return address if isinstance(address, str) else None
+                raise MachineError(
+                    f"{file}: must be the file of a running Dask scheduler, got none"
+                ) from None
+        sleep(0.05)
 
 
 class _RemoteClient(Client):

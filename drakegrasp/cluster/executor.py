@@ -1,8 +1,7 @@
 """Runs tasks on Dask's workers, some of which may die.
 
 Input: a function and items. Output: the results, in any order. A few tasks per worker are in
-flight, and a completed task is forgotten, so the memory does not grow with the number of tasks.
-Several items that take almost no time are put in one task, because each task costs some messages. A
+flight, and a completed task is forgotten, so the memory does not grow with the number of tasks. A
 task whose worker died is given to another worker. The items themselves ensure that this ends (see
 `drakegrasp.runtime.journal`), so the limit on deaths is generous. A task that rendered a blank
 image is retried, because the OpenGL of a single worker may be broken.
@@ -17,7 +16,7 @@ interrupted while it waits, so the loss of workers would not be noticed until a 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from itertools import islice
@@ -37,10 +36,6 @@ R = TypeVar("R")
 
 #: Number of tasks in flight per worker: one that runs, and one that waits, to keep the worker busy.
 IN_FLIGHT = 2
-#: Items are combined until their task takes about this long [s], much longer than its messages.
-TASK_SECONDS = 0.25
-#: Maximum number of items in a task, because the next items may take far longer than the last.
-LARGEST = 4
 #: Time between two counts of the workers [s].
 COUNT_SECONDS = 2.0
 #: Time that the transfer of a result may take before the workers are counted again [s].
@@ -58,43 +53,19 @@ _CONTINUES = "the same command continues from here"
 
 @dataclass(eq=False)
 class _PendingTask(Generic[T]):
-    """A task in flight: some items, run one after the other.
+    """A task in flight.
 
     Attributes:
-        items: Items with which the function is called.
+        item: Item with which the function is called.
         future: Future of the task's last submission.
         given_up: Number of times that Dask gave up on the task.
         blank: Number of times that the task rendered a blank image.
     """
 
-    items: Sequence[T]
+    item: T
     future: Future | None = None
     given_up: int = 0
     blank: int = 0
-
-
-@dataclass(frozen=True)
-class _TaskResult(Generic[R]):
-    """The result of a task: the results of its first items, at least one, and its duration [s]."""
-
-    results: list[R]
-    seconds: float
-
-
-def _run_items(function: Callable[[T], R], items: Sequence[T]) -> _TaskResult[R]:
-    """Return the results of the items before the first error; if there are none, raise the error.
-
-    In this way an error does not discard results, and Dask transfers it like any other error.
-    """
-    start, results = time.monotonic(), list[R]()
-    for item in items:
-        try:
-            results.append(function(item))
-        except Exception:
-            if not results:
-                raise
-            break
-    return _TaskResult(results, time.monotonic() - start)
 
 
 class DaskExecutor:
@@ -117,7 +88,6 @@ class DaskExecutor:
         self._counted = -float("inf")
         self._empty_since: float | None = None
         self._said = False
-        self._together = 1
         self.pool = WorkerPool()
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -128,37 +98,28 @@ class DaskExecutor:
                 are lost.
             Exception: The error that the function raised.
         """
-        remaining, self._together = iter(items), 1
+        remaining = iter(items)
         done: SimpleQueue[str] = SimpleQueue()
         pending: dict[str, _PendingTask[T]] = {}
 
         while True:
             # Keep a few tasks per worker in flight; take items only when they can be submitted.
             self._count_workers()
-            while len(pending) < IN_FLIGHT * max(1, len(self._workers)):
-                together = tuple(islice(remaining, self._together))
-                if not together:
-                    break
-                self._submit(function, _PendingTask(together), pending, done)
+            room = IN_FLIGHT * max(1, len(self._workers)) - len(pending)
+            for item in islice(remaining, max(0, room)):
+                self._submit(function, _PendingTask(item), pending, done)
             if not pending:
                 return
 
             # Wait for a task. If it failed because of its worker, submit it again.
             task = pending.pop(self._next_done(done))
             try:
-                result: _TaskResult[R] = self._gather(cast(Future, task.future))
+                result: R = self._gather(cast(Future, task.future))
             except (KilledWorker, BlankImageError) as error:
                 self._refuse_retry(task, error)
                 self._submit(function, task, pending, done)
-                continue
-
-            # Submit the items from the one that raised an error again; then it is the first item,
-            # and its error is raised.
-            self._adapt_together(result)
-            rest = task.items[len(result.results) :]
-            if rest:
-                self._submit(function, _PendingTask(rest), pending, done)
-            yield from result.results
+            else:
+                yield result
 
     def _submit(
         self,
@@ -169,7 +130,7 @@ class DaskExecutor:
     ) -> None:
         """Submit a task; its key goes into `done` when it ends."""
         # A task writes files, so Dask must not reuse the result of an earlier equal task.
-        future = self._client.submit(_run_items, function, task.items, pure=False)
+        future = self._client.submit(function, task.item, pure=False)
         task.future, pending[future.key] = future, task
         future.add_done_callback(lambda ended: done.put(ended.key))
 
@@ -195,11 +156,6 @@ class DaskExecutor:
                     raise
                 self._count_workers()
         raise _scheduler_lost("its tasks are cancelled")
-
-    def _adapt_together(self, result: _TaskResult[Any]) -> None:
-        """Choose the number of items of the next task by the duration of the last task."""
-        fit = TASK_SECONDS * len(result.results) / max(result.seconds, 1e-6)
-        self._together = int(max(1, min(fit, 2 * self._together, LARGEST)))
 
     def _refuse_retry(self, task: _PendingTask[Any], error: Exception) -> None:
         """Check that a failed task may be submitted again.

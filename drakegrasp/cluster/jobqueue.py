@@ -1,340 +1,191 @@
-"""Workers in jobs of a batch scheduler, with the user's jobqueue.yaml; needs extra `[jobqueue]`.
+"""Workers in jobs of a batch scheduler, by dask-jobqueue; needs the extra `[jobqueue]`.
 
-Each kind of scheduler is a short class here. It names the class of dask-jobqueue that submits the
-jobs, and overrides what differs from SLURM.
+A kind is a class of dask-jobqueue, whose options are its settings; jobqueue.yaml of the user states
+everything else. What is added here: connections need a
+certificate, a worker is a process of one thread with Dask's settings of this program, and a lost
+job is replaced.
+
 dask-jobqueue (0.9) quotes nothing in a script, so the shell would split a path at a blank and run a
-command in `$(...)`. Each path goes into a script through `_word`; names and addresses are plain
-(`kinds.refuse_unplain`), and the rest are numbers.
+command in `$(...)`. Here every text of the command line is a word of the shell.
 """
 
 from __future__ import annotations
 
+import inspect
+import json
 import math
-import re
 import shlex
-import shutil
-import subprocess
 import sys
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
 import dask
-import dask_jobqueue
-from distributed import SpecCluster, Status
+from distributed import Client, SpecCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
-from drakegrasp.cluster.certificates import security_of
-from drakegrasp.cluster.connect import LOOPBACK, NANNY_PRELOAD, dask_settings, dask_variables
-from drakegrasp.cluster.kinds import REMOTE, Remote, memory_bytes
-from drakegrasp.errors import ConfigError, MachineError, counted
+from drakegrasp.cluster.certificates import made_or_given, security_of
+from drakegrasp.cluster.connect import LOOPBACK, closing_cluster, dask_settings
+from drakegrasp.cluster.kinds import OPTIONS, Local, memory_bytes
+from drakegrasp.errors import ConfigError, MachineError, counted, one_line
 
 #: Memory of a worker, if neither the user nor jobqueue.yaml states it.
 WORKER_MEMORY = "2GB"
 #: Time between two checks for lost jobs [s]; a job that is missing twice in a row is lost.
 REFILL_SECONDS = 20.0
-#: Time before the walltime of its job at which a worker ends by itself, and the random variation of
-#: this time [s]; they are shorter for short jobs. In this way units are not interrupted, and jobs
-#: do not all end at the same time.
-LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
-#: Name of the jobs, unless jobqueue.yaml states another than the default of dask-jobqueue.
-NAME, _DEFAULT_NAME = "drakegrasp", "dask-worker"
-#: Keys of jobqueue.yaml that a newcomer looks for among the options.
-_SITE = ("queue", "account", "project", "job-extra-directives")
-#: A number of days, hours, minutes or seconds.
-_NUMBER = re.compile("[0-9]{1,6}")
+#: Arguments of every job of dask-jobqueue; the others are the scheduler's own.
+_COMMON = ("self", "scheduler", "name", "config_name")
 
 
-class Jobs(Remote):
-    """Jobs with several cores each, and a worker on each core.
+class Jobs(Local):
+    """Jobs with several cores each, and a worker on each core; the base of all batch schedulers.
 
     Attributes:
         of: Class of dask-jobqueue.
-        title: Name of the scheduler.
-        log: Directives that name the log file; empty if the scheduler names it after the job.
-        test: Command that asks the scheduler whether it would run a script; empty if it has none.
-        alone: Unit of a walltime in jobqueue.yaml that is a single number [s].
-        pair: Units of the two numbers of a walltime with a single colon [s].
     """
 
-    options = (*REMOTE, "walltime")
+    options = OPTIONS
     of: ClassVar[type[Any]]
-    title: ClassVar[str]
-    log: ClassVar[tuple[str, ...]] = ()
-    test: ClassVar[tuple[str, ...]] = ()
-    alone: ClassVar[float] = 1.0
-    pair: ClassVar[tuple[float, float]] = (60.0, 1.0)
+
+    def __init_subclass__(cls) -> None:
+        """Take the scheduler's own options as settings of the kind."""
+        parameters = inspect.signature(cls.of.job_cls.__init__).parameters.values()
+        own = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+        cls.settings = tuple(name for name in own if name not in (*_COMMON, *OPTIONS))
+        cls.options = tuple(name for name in OPTIONS if name != "walltime" or name in own)
 
     def __post_init__(self) -> None:
-        """Reject a malformed walltime, and jobs without a number of workers."""
+        """Reject jobs without a number of workers."""
         super().__post_init__()
-        if self.walltime is not None:
-            walltime_seconds(self.walltime)
         if self.workers is None:
             raise ConfigError(f"--workers must be given with --cluster {self.kind}")
-        self.listening()
-        self.per_job = int(self.cores or self.setting("cores") or 1)
+        self.per_job = int(self.cores or self._site("cores") or 1)
         self.jobs = math.ceil(self.workers / self.per_job)
-        # None means that jobqueue.yaml states the memory of a job.
-        self.memory = self.memory or (None if self.setting("memory") else WORKER_MEMORY)
 
-    def setting(self, key: str) -> Any:
+    def _site(self, key: str) -> Any:
         """Return a value of the user's jobqueue.yaml, or dask-jobqueue's default."""
         return dask.config.get(f"jobqueue.{self.of.job_cls.config_name}.{key}", None)
 
-    @classmethod
-    def elsewhere(cls) -> str:
-        """Return which keys of jobqueue.yaml state what no option states."""
-        section = f"jobqueue.{cls.of.job_cls.config_name}"
-        keys = ", ".join(key for key in _SITE if key in dask.config.get(section))
-        return f": {section} in ~/.config/dask/jobqueue.yaml has {keys}"
-
-    def listens(self) -> bool:
-        """Return whether jobqueue.yaml states where the scheduler listens."""
-        options = self.setting("scheduler-options") or {}
-        return bool(self.setting("interface") or {"host", "interface"} & set(options))
-
     def line(self) -> str:
         """Return a description of the resources that each job requests."""
-        memory = (
-            "memory as in jobqueue.yaml" if self.memory is None else f"{self.memory} per worker"
-        )
-        walltime = f"walltime {self._walltime() or 'of the queue'}"
-        jobs = f"{counted(self.jobs, f'{self.title} job')} ({self.per_job} in each)"
+        jobs = f"{counted(self.jobs, f'{self.kind} job')} ({self.per_job} in each)"
+        memory = self.memory or ("as in jobqueue.yaml" if self._site("memory") else WORKER_MEMORY)
+        walltime = self.walltime or self._site("walltime") or "of the queue"
         workers = counted(self.per_job * self.jobs, "worker")
-        return f"{workers} in {jobs}, {memory}, {walltime}"
+        return f"{workers} in {jobs}, memory {memory}, walltime {walltime}"
 
-    def _walltime(self) -> str | None:
-        """Return the time limit of a job; None if it is not stated."""
-        return self.walltime or self.setting("walltime")
-
-    def seconds(self) -> float | None:
-        """Return the time limit of a job [s]."""
-        if self.walltime is not None:
-            return walltime_seconds(self.walltime)
-        told = self.setting("walltime")
-        return None if told is None else walltime_seconds(str(told), self.alone, self.pair)
-
-    def job_memory(self) -> int:
-        """Return the memory of a job [bytes]."""
-        if self.memory is None:
-            return memory_bytes(str(self.setting("memory")))
-        return self.per_job * memory_bytes(self.memory)
-
-    def asks(self) -> dict[str, Any]:
-        """Return the resources that a job requests, as options of the scheduler's class."""
-        # The user's directives come later, and override ours.
-        log = () if self.setting("log-directory") else self.log
-        told = self.setting("job-extra-directives") or ()
-        return {"walltime": self.told_walltime(), "job_extra_directives": [*log, *told]}
-
-    def told_walltime(self) -> str | None:
-        """Return the user's time limit as H:MM:SS; None if jobqueue.yaml states it."""
-        return None if self.walltime is None else clock(walltime_seconds(self.walltime))
-
-    def job(self, security: Security | None) -> dict[str, Any]:
-        """Return all options of a job."""
-        # Options that are None or not listed here are taken from the user's jobqueue.yaml.
-        memory = None if self.memory is None else f"{self.job_memory()}B"
+    def _job(self, security: Security | None) -> dict[str, Any]:
+        """Return the arguments of a job; jobqueue.yaml states those that are None."""
+        memory = self.memory or (None if self._site("memory") else WORKER_MEMORY)
+        total = None if memory is None else f"{self.per_job * memory_bytes(memory)}B"
+        prologue, arguments = self._site("job-script-prologue"), self._site("worker-extra-args")
         return {
             "cores": self.per_job,
             "processes": self.per_job,
-            "memory": memory,
-            "job_name": NAME if (name := self.setting("name")) == _DEFAULT_NAME else name,
+            "memory": total,
             "interface": self.interface,
             "security": security,
-            "worker_extra_args": [
-                *(self.setting("worker-extra-args") or ()),
-                *_lifetime(self.seconds()),
-                f"--dashboard-address={LOOPBACK}:0",
-                # The command that starts a worker does not read the preload of the settings.
-                f"--preload-nanny={NANNY_PRELOAD}",
-                *([f"--host={LOOPBACK}"] if "host" in self.workers_listening() else []),
-            ],
-            "job_script_prologue": [*(self.setting("job-script-prologue") or ()), *_exports()],
-            **self.asks(),
+            # Every user of the worker's machine could read an open port.
+            "worker_extra_args": [*(arguments or ()), f"--dashboard-address={LOOPBACK}:0"],
+            "job_script_prologue": [*(prologue or ()), *_exports()],
+            **({} if self.walltime is None else {"walltime": self.walltime}),
+            **{key: _value(text) for key, text in self.own.items()},
         }
 
     def script(self, out: Path) -> str:
-        """Return the script of a job, with placeholders for scheduler address and certificates."""
+        """Return the script of a job, with placeholders for scheduler address and certificates.
+
+        Raises:
+            ConfigError: If dask-jobqueue misses an option.
+        """
         keys = out / ".tls-RUN"
         files = self.tls_files or (keys / "ca.pem", keys / "cert.pem", keys / "key.pem")
-        options = self.job(security_of(files) if self.tls else None)
-        protocol = "tls://" if self.tls else None
-        job = quoted(self.of.job_cls)(
-            f"{protocol or 'tcp://'}SCHEDULER:PORT", name="WORKER", protocol=protocol, **options
-        )
+        security, protocol = (security_of(files), "tls://") if self.tls else (None, "tcp://")
+        try:
+            job = quoted(self.of.job_cls)(
+                f"{protocol}SCHEDULER:PORT", "WORKER", protocol=protocol, **self._job(security)
+            )
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"--cluster {self.kind}: {one_line(error)}") from None
         return str(job.job_script())
 
     def submission(self) -> str:
         """Return the command that submits a script."""
         return str(self.of.job_cls.submit_command)
 
-    def start(self, security: Security | None) -> SpecCluster:
-        """Submit the jobs, if the scheduler would run them, and replace lost jobs."""
+    @contextmanager
+    def connected(self, out: Path) -> Iterator[Client]:
+        """Submit the jobs, and yield a client; the jobs end with the block."""
+        with (
+            made_or_given(self.tls, self.tls_files, out) as security,
+            dask.config.set(dask_settings()),
+        ):
+            try:
+                cluster = self._start(security)
+            except ConfigError:
+                raise
+            # Each class raises its own errors; report them all as errors of the machine.
+            except Exception as error:
+                raise MachineError(f"the workers did not start: {one_line(error)}") from None
+            with closing_cluster(cluster), Client(cluster) as client:
+                yield client
+
+    def _start(self, security: Security | None) -> SpecCluster:
+        """Submit the jobs, and replace lost jobs from then on."""
+        listening = {} if self.host is None else {"host": self.host}
         cluster = self.of(
             job_cls=quoted(self.of.job_cls),
-            **self.job(security),
             scheduler_options={
                 "dashboard_address": f"{LOOPBACK}:0",
-                **(self.setting("scheduler-options") or {}),
-                **self.listening(),
+                **(self._site("scheduler-options") or {}),
+                **listening,
             },
+            **self._job(security),
         )
-        try:
-            self.refuse_bad_job(cluster.job_script())
-        except MachineError:
-            cluster.close()
-            raise
-        cluster.scale(jobs=self.jobs)
 
-        async def refill() -> None:
+        async def submit() -> None:
+            # Not `scale`, which submits later and logs the error of the scheduler's command.
+            for _ in range(self.jobs):
+                cluster.worker_spec.update(cluster.new_worker_spec())
+            await cluster
             PeriodicCallback(_Refill(cluster, self.jobs), 1000.0 * REFILL_SECONDS).start()
 
-        cluster.sync(refill)
+        try:
+            cluster.sync(submit)
+        except BaseException:
+            for job in cluster.workers.values():
+                job.status = Status.failed  # or Dask would not close the cluster
+            cluster.close()
+            raise
         return cluster
 
-    def refuse_bad_job(self, script: str) -> None:
-        """Ask the scheduler whether it would run a job, because a later failure is not visible.
 
-        Raises:
-            MachineError: If the scheduler's commands are missing, or it would not run the job.
-        """
-        command = shlex.split(self.submission())[0]
-        if shutil.which(command) is None:
-            raise MachineError(
-                f"there is no {command} on the PATH: start this on a machine that submits jobs"
-            )
-        if not self.test:
-            return
-        test = subprocess.run(self.test, input=script, capture_output=True, text=True)
-        if test.returncode:
-            raise MachineError(f"{self.title} does not accept the job: {test.stderr.strip()}")
+def jobs_of(cluster: type[Any]) -> type[Jobs]:
+    """Return the kind whose jobs are those of a class of dask-jobqueue."""
+    kind: type[Jobs] = type(cluster.__name__, (Jobs,), {"of": cluster})
+    return kind
 
 
-class Slurm(Jobs):
-    """SLURM: memory of a job by --mem."""
-
-    of, title, test = dask_jobqueue.SLURMCluster, "SLURM", ("sbatch", "--test-only")
-    log = (f"-o {NAME}-%j.log",)
-    alone = 60.0
-
-    def told_walltime(self) -> str | None:
-        """Return the user's time limit, which has the form of SLURM."""
-        return self.walltime
+def _value(text: str) -> Any:
+    """Return a setting as dask-jobqueue takes it: a number or a boolean, or a text."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        return text
+    return value if isinstance(value, bool | int) else text
 
 
-class Pbs(Jobs):
-    """PBS: cores and memory of a job by one -l select."""
-
-    of, title, log = dask_jobqueue.PBSCluster, "PBS", ("-j oe",)
-
-
-class Lsf(Jobs):
-    """LSF: -M limits the memory of a job, in the unit of lsf.conf; times are in minutes."""
-
-    of, title, log = dask_jobqueue.LSFCluster, "LSF", (f"-o {NAME}-%J.log",)
-    alone, pair = 60.0, (3600.0, 60.0)
-
-    def told_walltime(self) -> str | None:
-        """Return the user's time limit as H:MM, rounded up."""
-        if self.walltime is None:
-            return None
-        minutes = math.ceil(walltime_seconds(self.walltime) / 60.0)
-        return f"{minutes // 60}:{minutes % 60:02d}"
-
-
-class Sge(Jobs):
-    """Grid Engine: `mem_free` of a slot, unless jobqueue.yaml has a resource-spec."""
-
-    of, title = dask_jobqueue.SGECluster, "Grid Engine"
-
-    def __post_init__(self) -> None:
-        """Reject jobs with several cores if the site's parallel environment is not stated."""
-        super().__post_init__()
-        directives = self.setting("job-extra-directives") or ()
-        if self.per_job > 1 and not any("-pe " in directive for directive in directives):
-            raise ConfigError(
-                f"--cores must be 1 with --cluster {self.kind}, got {self.per_job}: for more, "
-                f"job-extra-directives in jobqueue.yaml must have -pe NAME {self.per_job}"
-            )
-
-    def asks(self) -> dict[str, Any]:
-        """Return the time limit and the memory of a job."""
-        if self.setting("resource-spec"):
-            return super().asks()
-        slot = math.ceil(self.job_memory() / self.per_job / 2**20)
-        return {**super().asks(), "resource_spec": f"mem_free={slot}M"}
-
-
-class Htcondor(Jobs):
-    """HTCondor: a job states its memory and disk in its ClassAd; only our time limit ends it."""
-
-    of, title = dask_jobqueue.HTCondorCluster, "HTCondor"
-
-    def asks(self) -> dict[str, Any]:
-        """Return the disk and the time limit of a job."""
-        disk = None if self.setting("disk") else f"{self.per_job}GB"
-        file = f"{NAME}-$(ClusterId).log"
-        log = {} if self.setting("log-directory") else {"output": file, "error": file}
-        extra = {"batch_name": NAME, **log, **(self.setting("job-extra-directives") or {})}
-        if (seconds := self.seconds()) is not None:
-            extra.setdefault("allowed_job_duration", math.ceil(seconds))
-        return {"disk": disk, "job_extra_directives": extra}
-
-
-class Oar(Jobs):
-    """OAR: cores of one node; memory if jobqueue.yaml names the property that has it."""
-
-    of, title = dask_jobqueue.OARCluster, "OAR"
-    log = (f"-O {NAME}-%jobid%.log", f"-E {NAME}-%jobid%.log")
-    alone, pair = 3600.0, (3600.0, 60.0)
-
-    def asks(self) -> dict[str, Any]:
-        """Return the time limit and the property of memory."""
-        name = self.setting("memory-per-core-property-name") or "not_applicable"
-        return {**super().asks(), "memory_per_core_property_name": name}
-
-
-def clock(seconds: float) -> str:
-    """Return a time as HH:MM:SS."""
-    whole = math.ceil(seconds)
-    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}"
-
-
-def walltime_seconds(
-    text: str, alone: float = 60.0, pair: tuple[float, float] = (60.0, 1.0)
-) -> float:
-    """Return a time limit in seconds; the default units are those of SLURM.
-
-    SLURM's forms: M, M:S, H:M:S, D-H, D-H:M, D-H:M:S.
-
-    Args:
-        text: The time.
-        alone: Unit of a single number [s].
-        pair: Units of two numbers without days [s].
-
-    Raises:
-        ConfigError: If the text has none of these forms.
-    """
-    days, dash, rest = text.partition("-") if "-" in text else ("0", "", text)
-    parts = rest.split(":")
-    if len(parts) > 3 or not all(_NUMBER.fullmatch(part) for part in (days, *parts)):
-        raise ConfigError(f"walltime must be a time of SLURM such as 02:00:00, got {text[:40]!r}")
-    numbers = [int(p) for p in parts]
-    if dash or len(numbers) == 3:
-        hours, minutes, seconds = [*numbers, 0, 0][:3]
-        total = 86400.0 * int(days) + 3600.0 * hours + 60.0 * minutes + seconds
-    elif len(numbers) == 2:
-        total = pair[0] * numbers[0] + pair[1] * numbers[1]
-    else:
-        total = alone * numbers[0]
-    if total <= 0.0:
-        raise ConfigError(f"walltime must be longer than 0 s, got {text!r}")
-    return total
+def _exports() -> list[str]:
+    """Return Dask's settings as lines of a job script, because a job does not inherit settings."""
+    lines = []
+    for key, value in dask_settings().items():
+        name = key.upper().replace(".", "__").replace("-", "_")
+        lines.append(f"export DASK_{name}={shlex.quote(json.dumps(value))}")
+    return lines
 
 
 class _Quoted:
@@ -346,28 +197,19 @@ class _Quoted:
     config_name: str
 
     def __init__(
-        self,
-        *arguments: Any,
-        security: Security | None = None,
-        worker_extra_args: Sequence[str] = (),
-        **options: Any,
+        self, scheduler: str, name: str, *, security: Security | None = None, **options: Any
     ) -> None:
         """Take the arguments of the job."""
-        told = dask.config.get(f"jobqueue.{self.config_name}.python", None)
-        super().__init__(  # type: ignore[call-arg]
-            *arguments,
-            # If the certificates were given as `security`, their paths would not be quoted.
-            worker_extra_args=[*worker_extra_args, *self._tls_words(security)],
-            python=told or self._word(sys.executable),
-            **options,
-        )
-
-    def _tls_words(self, security: Security | None) -> Iterator[str]:
-        """Yield a worker's options for its certificates."""
+        if dask.config.get(f"jobqueue.{self.config_name}.python", None) is None:
+            options["python"] = sys.executable
+        # If the certificates were given as `security`, their paths would not be quoted.
         files = {} if security is None else security.get_tls_config_for_role("worker")
-        for key, value in files.items():
+        for key, path in files.items():
             if key != "ciphers":  # Dask has no option for them
-                yield from (f"--tls-{key.replace('_', '-')}", self._word(str(value)))
+                words = [f"--tls-{key.replace('_', '-')}", self._word(str(path))]
+                options["worker_extra_args"] = [*options["worker_extra_args"], *words]
+        texts = {key: self._word(v) for key, v in options.items() if isinstance(v, str)}
+        super().__init__(scheduler, name, **{**options, **texts})  # type: ignore[call-arg]
 
     def _word(self, text: str) -> str:
         """Return a text as a word of a shell.
@@ -377,7 +219,7 @@ class _Quoted:
                 between quotation marks.
         """
         if not text.isprintable():
-            raise ConfigError(f"a path in a job must be printable, got {text!r}")
+            raise ConfigError(f"a text in a job must be printable, got {text!r}")
         word = shlex.quote(text)
         # HTCondor replaces `$(NAME)` before the shell reads the line.
         return word.replace("$", "$(DOLLAR)") if self.config_name == "htcondor" else word
@@ -385,23 +227,8 @@ class _Quoted:
 
 @cache
 def quoted(job: type[Any]) -> type[Any]:
-    """Return a class of jobs in which our paths are quoted."""
+    """Return a class of jobs in which texts of the command line are quoted."""
     return types.new_class(f"Quoted{job.__name__}", (_Quoted, job))
-
-
-def _exports() -> list[str]:
-    """Return Dask's settings as lines of a job script, because a job does not inherit settings."""
-    told = dask_variables(dask_settings())
-    return [f"export {name}={shlex.quote(value)}" for name, value in told.items()]
-
-
-def _lifetime(seconds: float | None) -> list[str]:
-    """Return the options that make a worker end before the walltime [s] of its job."""
-    if seconds is None:
-        return []
-    margin = min(LIFETIME_MARGIN, seconds / 4.0)
-    stagger = min(LIFETIME_STAGGER, margin / 2.0)
-    return ["--lifetime", f"{seconds - margin:.0f}s", "--lifetime-stagger", f"{stagger:.0f}s"]
 
 
 class _Refill:

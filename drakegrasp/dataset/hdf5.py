@@ -18,7 +18,6 @@ import numpy.typing as npt
 from drakegrasp.dataset.schema import Field
 from drakegrasp.errors import DataError, first_line, printable
 from drakegrasp.foreign_files import NAME_RULE, is_name, refuse_irregular
-from drakegrasp.runtime.files import refuse_half_replaced
 
 try:
     import deflate
@@ -46,10 +45,9 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
 
     Raises:
         OSError: If the file cannot be read.
-        DataError: If a process died while it replaced the files of this folder, or if the file has
-            links, values stored outside of it, or more rows than it can hold.
+        DataError: If the file has links, values stored outside of it, or more rows than it can
+            hold.
     """
-    refuse_half_replaced(path.parent)
     refuse_irregular(path)
     try:
         file = h5py.File(path, "r")

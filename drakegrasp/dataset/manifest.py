@@ -51,7 +51,7 @@ from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.folder import HAND_FOLDER, carried_hand, hand_digest
 from drakegrasp.hand.settings import override_config
-from drakegrasp.runtime.files import probe_folder, refuse_half_replaced, write_atomic
+from drakegrasp.runtime.files import probe_folder, write_atomic
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
@@ -349,11 +349,9 @@ def read_manifest(out: Path) -> Manifest:
     """Return the manifest of a dataset's directory.
 
     Raises:
-        DataError: If the manifest is missing, cannot be read or has another schema, or if a process
-            died while it replaced the files.
+        DataError: If the manifest is missing, cannot be read or has another schema.
     """
     path = out / FILE_NAME
-    refuse_half_replaced(out)
     # A missing file gets another message than a broken one.
     try:
         tree, content = read_mapping(path, "a readable manifest")

@@ -30,7 +30,7 @@ from drakegrasp.dataset.assembly.survey import (
     survey_tasks,
 )
 from drakegrasp.dataset.card import write_card
-from drakegrasp.dataset.lock import BuildLog, Holder, build_lock
+from drakegrasp.dataset.lock import BuildLog, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
@@ -240,7 +240,7 @@ def build_locked(
     config: Config,
     execute: Executor,
     *,
-    dead: Holder | None,
+    dead: str | None,
     postures: Attempts | None = None,
     part: Part | None = None,
     pool: WorkerPool | None = None,
@@ -253,7 +253,7 @@ def build_locked(
         out: Directory of the dataset; new, empty, or with a dataset of this configuration.
         config: Configuration of the dataset.
         execute: Runs the tasks.
-        dead: Process that held the lock before and died, as `build_lock` yields it.
+        dead: Name of the process that held the lock before and died, as `build_lock` yields it.
         postures: Postures to try instead of palm poses of samplers. The configuration states their
             digest, see `posture_config`. Invalid rows are reported and not tried.
         part: Part of the work units to run; all if None. The assembled files are written when all

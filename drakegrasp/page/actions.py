@@ -6,18 +6,17 @@ recordings in a folder that is removed at the end.
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import FileIO
 from pathlib import Path
 from typing import NamedTuple
+
+from filelock import FileLock, Timeout
 
 from drakegrasp.dataset.rejections import (
     FILE_NAME,
@@ -27,7 +26,6 @@ from drakegrasp.dataset.rejections import (
     write_decisions,
 )
 from drakegrasp.errors import DataError
-from drakegrasp.runtime.files import lock_file, open_own
 
 #: A process that writes `reject.json` locks this file, and removes it when the decision is written.
 LOCK_NAME = f".{FILE_NAME}.lock"
@@ -116,38 +114,22 @@ class DecisionFile:
 def _held(path: Path) -> Iterator[None]:
     """Hold the kernel's lock on a file while the block runs, and remove it at the end.
 
-    On a file system without locks the block runs without a lock.
-
     Raises:
         DataError: If another process holds the lock for a long time.
         OSError: If the file cannot be created.
     """
-    file = _take(path)
     try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        file.close()
-
-
-def _take(path: Path) -> FileIO:
-    """Return the lock file, locked by this process."""
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end:
-        file = FileIO(open_own(path, os.O_RDWR | os.O_CREAT), "r+")
+        held = FileLock(path).acquire(timeout=PATIENCE, poll_interval=0.002)
+    except Timeout:
+        raise DataError(
+            f"{path}: must be held for a moment only, got a process that holds it for "
+            f"{PATIENCE:.0f} s"
+        ) from None
+    with held:
         try:
-            # The previous holder may have removed the file after this process opened it.
-            if lock_file(file) is not False and os.path.samestat(
-                path.stat(), os.fstat(file.fileno())
-            ):
-                return file
-        except FileNotFoundError:
-            pass
-        file.close()
-        time.sleep(0.002)
-    raise DataError(
-        f"{path}: must be held for a moment only, got a process that holds it for {PATIENCE:.0f} s"
-    )
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 #: Time limit of a replay [s].

@@ -5,11 +5,6 @@ the C++ part, and the allocator keeps freed memory for later use, separately for
 
 Workers run with `DRAKE_ALLOW_NETWORK=none`. Drake (1.51 to 1.58) then refuses to create some
 objects even if they would not use the network; `allow_network` relaxes the ban for these.
-
-A process is identified by its machine, the boot of the machine, its number and its start time,
-since the kernel reuses numbers. psutil cannot replace this: it computes the start time of a process
-from the wall clock, which may be set, so a living process could look like another one. Linux's
-clock ticks since the boot never change.
 """
 
 from __future__ import annotations
@@ -23,7 +18,6 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import cache, wraps
 from importlib import import_module
 from importlib.util import find_spec
@@ -31,55 +25,18 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from drakegrasp.errors import MachineError
-from drakegrasp.runtime.allocator import has_jemalloc, kept_variables
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: File in which Linux has a number that is new at every boot of the machine.
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 #: Minimum time between two releases of free memory [s]; one takes about 20 ms.
 TRIM_SECONDS = 5.0
-#: Commands for jemalloc: clear the cache of this thread, and return the free pages of every arena
-#: (4096 is its MALLCTL_ARENAS_ALL).
-_PURGE = (b"thread.tcache.flush", b"arena.4096.purge")
 #: Smallest limit of virtual memory with which an image is rendered [byte]: with 1.0 GB OpenGL ends
 #: in a segmentation fault; 1.5 GB are enough for `figures`.
 RENDER_MEMORY = 1.5e9
 
 _trimmed = -TRIM_SECONDS
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Process:
-    """A process of some machine.
-
-    Attributes:
-        host: Name of the machine.
-        pid: Number of the process on that machine.
-        began: Clock ticks from the boot of the machine to the start of the process; -1 if unknown.
-        boot: Identifier of the boot of the machine; empty if unknown.
-    """
-
-    host: str
-    pid: int
-    began: int
-    boot: str
-
-    def runs(self) -> bool | None:
-        """Return whether the process still runs; None if this machine cannot know."""
-        if self.host != socket.gethostname():
-            return None
-        if self.boot != _boot() or not is_running(self.pid):
-            return False
-        return self.began == _began(self.pid)
-
-
-def this_process() -> Process:
-    """Return the calling process."""
-    pid = os.getpid()
-    return Process(host=socket.gethostname(), pid=pid, began=_began(pid), boot=_boot())
 
 
 def is_running(pid: int) -> bool:
@@ -90,33 +47,15 @@ def is_running(pid: int) -> bool:
         return False
     except PermissionError:
         return True
-    return _stat(pid)[:1] != ["Z"]
+    with suppress(OSError):
+        # The preceding name is in parentheses and may contain blanks.
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[:1] != ["Z"]
+    return True
 
 
 def host_label() -> str:
     """Return this machine's name in a form for names of files: short, without dots."""
     return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:20] or "-"
-
-
-def _boot() -> str:
-    try:
-        return _BOOT_ID.read_text().strip()
-    except OSError:
-        return ""
-
-
-def _began(pid: int) -> int:
-    fields = _stat(pid)
-    return int(fields[19]) if len(fields) > 19 else -1
-
-
-def _stat(pid: int) -> list[str]:
-    """Return Linux's fields about a process, beginning with its state; empty if there are none."""
-    try:
-        # The preceding name is in parentheses and may contain blanks.
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return []
 
 
 def available_cores() -> int:
@@ -178,19 +117,22 @@ def _trim() -> None:
     global _trimmed
     _trimmed = time.monotonic()
     process = ctypes.CDLL(None)
-    if has_jemalloc():
-        for order in _PURGE:
-            process.mallctl(order, None, None, None, ctypes.c_size_t(0))
-    elif hasattr(process, "malloc_trim"):  # other C libraries decide for themselves
+    if hasattr(process, "malloc_trim"):  # other C libraries decide for themselves
         process.malloc_trim(0)
 
 
 @contextmanager
 def allow_network(kind: str) -> Iterator[None]:
     """Allow Drake one kind of network use while the block runs, e.g. `package_map`."""
-    with kept_variables(_VARIABLE):
-        os.environ[_VARIABLE] = kind
+    before = os.environ.get(_VARIABLE)
+    os.environ[_VARIABLE] = kind
+    try:
         yield
+    finally:
+        if before is None:
+            del os.environ[_VARIABLE]
+        else:
+            os.environ[_VARIABLE] = before
 
 
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:

@@ -30,7 +30,7 @@ from drakegrasp.runtime.environment import available_cores
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: Maximum number of processes on one machine; a larger number is a typing error.
+#: Maximum number of workers; a larger number is a typing error.
 MOST_PROCESSES = 10_000
 #: Work that ends within this time [s] starts no processes, since starting them takes seconds.
 ALONE_SECONDS = 5.0
@@ -122,16 +122,20 @@ def moved_item(item: Any, folder: Path) -> Any:
     return (item[0], task) if isinstance(item, tuple) else task
 
 
-def count_workers(workers: int | None) -> int:
+def count_workers(workers: int | None, name: str = "workers") -> int:
     """Return how many processes of this machine to start; one per core if None.
+
+    Args:
+        workers: The number.
+        name: Name of the number, for the error message.
 
     Raises:
         ConfigError: If the number is not valid.
     """
     if workers is not None and workers < 1:
-        raise ConfigError(f"workers must be at least 1, got {workers}")
+        raise ConfigError(f"{name} must be at least 1, got {workers}")
     if workers is not None and workers > MOST_PROCESSES:
-        raise ConfigError(f"workers must be at most {MOST_PROCESSES:,}, got {workers}")
+        raise ConfigError(f"{name} must be at most {MOST_PROCESSES:,}, got {workers}")
     return available_cores() if workers is None else workers
 
 

@@ -4,19 +4,15 @@ A file is written under a temporary name in its own folder, closed, synced and r
 never sees half a file, and a crash leaves only a temporary file. A seal reveals any changed bit: it
 is the SHA-256 of all other bytes, in the user block that HDF5 leaves free at a file's start.
 
-Files of a folder that are replaced together are either all old or all new. When all new files are
-complete and synced under temporary names, a list of them is written, `replacement.json`: from then
-on the new files count. Each file gets its name, and the list is removed. A process that dies before
-it writes the list leaves the old files. A process that dies later leaves the list, and
-`complete_replacement` does the rest; until then nobody may read in the folder.
+Files of a folder that belong together are all complete before the first of them gets its name, and
+they get their names in order. The manifest of a dataset is the last: it is new only if all files
+are, and it tells files of another state, because each file has the signature of its manifest.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
-import json
 import os
 import re
 import secrets
@@ -25,14 +21,14 @@ import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from io import BufferedRandom, BufferedReader, BytesIO, FileIO
+from io import BufferedRandom, BufferedReader, FileIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import h5py
 
 from drakegrasp.errors import DataError, DiskFullError
-from drakegrasp.foreign_files import LARGEST_SEALED, read_json, refuse_irregular
+from drakegrasp.foreign_files import LARGEST_SEALED, refuse_irregular
 from drakegrasp.runtime.environment import host_label, is_running
 
 if TYPE_CHECKING:
@@ -51,10 +47,6 @@ _TEMPORARY = re.compile(r"\.(?P<host>[A-Za-z0-9-]+)~(?P<pid>\d+)~[0-9a-f]{12}\.t
 STALE_SECONDS = 3600.0
 #: Error numbers for a lack of room: on the disk, in the quota, or by a limit on the size of files.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-#: The list of files that are being replaced.
-LIST_NAME = "replacement.json"
-#: Time [s] that a reader waits for a process that is replacing files, which takes milliseconds.
-PATIENCE = 2.0
 
 
 @contextmanager
@@ -116,22 +108,13 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
 
     Args:
         path: Path of the file.
-        sealed: Whether to reserve room for a seal and set it, see `seal`. Such a file is built in
-            memory; for one that may be larger, see `new_hdf5`.
+        sealed: Whether to set a seal, see `seal`.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
     """
-    with atomic_path(path) as temporary:
-        if sealed:
-            content = BytesIO()
-            with h5py.File(content, "w", userblock_size=SEAL_SIZE, libver=FORMAT) as file:
-                yield file
-            temporary.write_bytes(content.getbuffer())
-            seal(temporary)
-        else:
-            with new_hdf5(temporary) as file:
-                yield file
+    with atomic_path(path) as temporary, new_hdf5(temporary, sealed=sealed) as file:
+        yield file
 
 
 @contextmanager
@@ -266,15 +249,6 @@ def temporary_name(path: Path) -> Path:
     return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
 
 
-def is_temporary_of(temporary: str, name: str) -> bool:
-    """Return whether a name is a result of `temporary_name` for a file of a given name."""
-    prefix = f".{name}"
-    return (
-        temporary.startswith(prefix)
-        and _TEMPORARY.fullmatch(temporary.removeprefix(prefix)) is not None
-    )
-
-
 def probe_folder(folder: Path) -> None:
     """Create a file in a folder and remove it again.
 
@@ -393,29 +367,12 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def lock_file(file: IO[bytes]) -> bool | None:
-    """Take the kernel's lock on an open file; it is freed when this process closes it or dies.
-
-    Args:
-        file: File that is open for writing, since NFS locks no other files.
-
-    Returns:
-        Whether this process now has the lock; None if the file system does not support locks.
-    """
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
-
-
 @contextmanager
 def replaced_together(folder: Path) -> Iterator[Callable[[str], Path]]:
     """Yield a function from a file's name to the path under which to write the file.
 
-    The files appear in the folder if the block succeeds. Only one process at a time may do this.
+    The files appear in the folder if the block succeeds, in the order in which they were begun.
+    Only one process at a time may do this.
 
     Args:
         folder: Folder of the files.
@@ -431,85 +388,12 @@ def replaced_together(folder: Path) -> Iterator[Callable[[str], Path]]:
 
     try:
         yield begin
-
-        # Sync the files before the list is written: a power cut could else leave empty files.
+        # Sync all before the first gets its name: a power cut could else leave empty files.
         for path in temporary.values():
             sync(path)
-        listed = {name: path.name for name, path in temporary.items()}
-        write_atomic(folder / LIST_NAME, json.dumps(listed, indent=1).encode() + b"\n")
-    except BaseException:
-        # Remove the list first: a list of missing files must not stay.
-        for path in (folder / LIST_NAME, *temporary.values()):
+        for name, path in temporary.items():
+            path.replace(folder / name)
+        sync(folder)
+    finally:
+        for path in temporary.values():
             path.unlink(missing_ok=True)
-        raise
-    complete_replacement(folder)
-
-
-def complete_replacement(folder: Path) -> bool:
-    """Give the files in a folder's list their names; return whether there was a list.
-
-    Raises:
-        DataError: If the file is not a list of files that are being replaced.
-        OSError: If the folder cannot be written.
-    """
-    path = folder / LIST_NAME
-    try:
-        listed = _read_list(path)
-    except FileNotFoundError:
-        return False
-
-    # A file that no longer exists under its temporary name already has its name.
-    for name, temporary in listed.items():
-        new = folder / temporary
-        try:
-            if not stat.S_ISREG(new.lstat().st_mode):
-                raise _no_list(path, f"{temporary!r}, which is no file")
-        except FileNotFoundError:
-            continue
-        new.replace(folder / name)
-
-    sync(folder)
-    path.unlink(missing_ok=True)
-    sync(folder)
-    return True
-
-
-def refuse_half_replaced(folder: Path) -> None:
-    """Raise an error if some files of a folder are old and others new.
-
-    Raises:
-        DataError: If the list is still there after `PATIENCE`: the process that wrote it is dead.
-    """
-    end = time.monotonic() + PATIENCE
-    while (folder / LIST_NAME).exists():
-        if time.monotonic() > end:
-            raise DataError(
-                f"{folder}: must hold files of one state, got some that were being replaced when a "
-                f"process died; `drakegrasp stats {folder}` completes this"
-            )
-        time.sleep(0.05)
-
-
-def _read_list(path: Path) -> dict[str, str]:
-    """Return the temporary name of each file in a list, by the name that the file shall get.
-
-    Raises:
-        FileNotFoundError: If there is no list.
-        DataError: If it names anything except files of its folder that were written for it.
-    """
-    try:
-        content = read_json(path)
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError) as error:
-        raise _no_list(path, f"a broken one ({error})") from None
-    if not isinstance(content, dict):
-        raise _no_list(path, "something else")
-    for name, temporary in content.items():
-        if "/" in name or not isinstance(temporary, str) or not is_temporary_of(temporary, name):
-            raise _no_list(path, f"{temporary!r} for {name!r}")
-    return content
-
-
-def _no_list(path: Path, got: str) -> DataError:
-    return DataError(f"{path}: must be a list of files that are being replaced, got {got}")

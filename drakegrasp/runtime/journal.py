@@ -25,19 +25,14 @@ a second chance.
 
 The file is text: a line of JSON with the unit's identity and the previous deaths, the record, and
 the output of faulthandler.
-
-Tests cause deaths by the environment variable DRAKEGRASP_TEST_FAULT, which nobody else sets:
-`KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt, `KIND:OBJECT` for preparing an object,
-`KIND:OBJECT:distances` for its distance field, `KIND:OBJECT:predict` for the screen; several faults
-are separated by blanks.
 """
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import json
 import os
+import runpy
 import signal
 import sys
 from collections.abc import Iterator, Mapping
@@ -48,9 +43,10 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from drakegrasp.errors import BlankImageError
+from filelock import lock_descriptor
+
 from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
-from drakegrasp.runtime.files import lock_file, temporary_name
+from drakegrasp.runtime.files import temporary_name
 
 #: Number of successive crashes in one step after which the step is not tried again: one crash may
 #: be the machine's fault.
@@ -75,7 +71,8 @@ _CRASH_MARK, _TIME_MARKS = b"Fatal Python error", (b"Timeout (", b"hread 0x")
 ATTEMPT, PREPARE = "try", "prepare"
 #: Step in the record before the first step.
 _START = "start"
-#: Variable that specifies the deaths that a test requests.
+#: Variable with the Python file of a test, whose function `cause` is called at each place, and with
+#: what that function gets: `FILE;FAULTS`.
 VARIABLE = "DRAKEGRASP_TEST_FAULT"
 
 
@@ -253,7 +250,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     try:
         temporary.write_bytes(line + b"\n" + _record(_START, 0))
         with temporary.open("r+b", buffering=0) as file:
-            lock_file(file)
+            _lock(file.fileno())
             file.seek(0, os.SEEK_END)  # faulthandler writes here
             temporary.replace(path)
             with _crashes_marked(file):
@@ -267,6 +264,14 @@ def _record(step: str, passed: int) -> bytes:
     return f"{passed:016x} {step}".encode("ascii").ljust(_RECORD_SIZE - 1) + b"\n"
 
 
+def _lock(descriptor: int) -> bool:
+    """Take the kernel's lock on a journal; return whether no other process has it."""
+    try:
+        return lock_descriptor(descriptor, blocking=False)
+    except OSError:
+        return True  # on a file system without locks, nobody is known to hold one
+
+
 def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     """Return how earlier runs died, or None if one of them is still running."""
     history = _History()
@@ -275,8 +280,7 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     try:
         refuse_irregular(path, LARGEST_TEXT)
         with path.open("r+b") as file:  # NFS locks only files that are open for writing
-            # On a file system without locks (None), nobody is known to hold a lock.
-            if lock_file(file) is False:
+            if not _lock(file.fileno()):
                 return None
             head, _, rest = file.read().partition(b"\n")
         content = json.loads(head)
@@ -312,49 +316,13 @@ def _crashes_marked(file: FileIO) -> Iterator[None]:
 
 
 def inject_fault(*place: str | int) -> None:
-    """Cause the fault that the environment requests at a place, if any.
+    """Let a test cause a fault at a place; nobody else sets the variable.
 
     Args:
         place: An object's name; for an attempt also its candidate and its stand-off, for other
             steps what they do.
-
-    Raises:
-        MemoryError: For the kind `memory`.
-        BlankImageError: For the kind `blank`.
     """
-    faults = os.environ.get(VARIABLE)
-    if faults is None:
-        return
-    label = ":".join(map(str, place))
-    for fault in faults.split():
-        kind, _, target = fault.partition(":")
-        if target == label:
-            _cause(kind)
-
-
-def _cause(kind: str) -> None:
-    # The process ends.
-    if kind == "crash":
-        ctypes.string_at(0)  # a segmentation fault
-    elif kind == "abort":
-        os.abort()
-    elif kind == "exit":
-        os._exit(3)
-
-    # It never returns.
-    elif kind == "hang":
-        while True:  # in C, without the interpreter's lock, like a simulation
-            ctypes.CDLL(None).pause()
-    elif kind == "freeze":
-        ctypes.PyDLL(None).pause()  # in C, with the interpreter's lock
-    elif kind == "spin":
-        while True:  # computes; the others only wait
-            pass
-
-    # An error of Python.
-    elif kind == "memory":
-        raise MemoryError
-    elif kind == "blank":
-        raise BlankImageError("a blank image, by fault injection")
-    else:
-        raise ValueError(f"{VARIABLE}: must name a known kind of fault, got {kind!r}")
+    text = os.environ.get(VARIABLE)
+    if text is not None:
+        script, _, faults = text.partition(";")
+        runpy.run_path(script)["cause"](faults, ":".join(map(str, place)))

@@ -2,7 +2,7 @@
 
 Input: a .npy file whose one element is a Python object, as DexGraspBench writes them. Output: the
 object, if it consists of dictionaries, lists, texts, numbers and NumPy arrays; anything else is
-rejected before it is created.
+rejected before it is created. NumPy writes such files by the protocols 3 and 4 of pickle.
 """
 
 from __future__ import annotations
@@ -64,15 +64,6 @@ class _Array:
         _, *self.parts = state
 
 
-def _buffered(data: Any, kind: Any, shape: Any, order: Any, *_: Any) -> _Array:
-    """Replacement of NumPy's `_frombuffer`, with which pickles of protocol 5 create arrays."""
-    if order not in ("C", "F"):
-        raise ValueError(f"order of an array must be C or F, got {order!r}")
-    array = _Array()
-    array.parts = (shape, kind, order == "F", data)
-    return array
-
-
 def _array(shape: Any, kind: Any, fortran: Any, data: Any) -> np.ndarray:
     """Return an array all of whose bytes are in the file."""
     shape = shape if isinstance(shape, tuple) else (shape,)
@@ -80,15 +71,15 @@ def _array(shape: Any, kind: Any, fortran: Any, data: Any) -> np.ndarray:
         raise ValueError("an array must have a shape and a type")
     objects = kind.dtype.hasobject
     needed = math.prod(shape) * (1 if objects else kind.dtype.itemsize)
-    if not isinstance(data, list if objects else bytes | bytearray) or len(data) != needed:
+    if not isinstance(data, list if objects else bytes) or len(data) != needed:
         raise ValueError("an array must have as many bytes as its shape says")
+    array = np.empty(math.prod(shape), kind.dtype)
     if objects:
-        array = np.empty(len(data), dtype=object)
         for i, each in enumerate(data):
             array[i] = each
-        return array.reshape(shape, order="F" if fortran else "C")
-    array = np.frombuffer(bytes(data), kind.dtype) if data else np.empty(0, kind.dtype)
-    array = array.reshape(shape, order="F" if fortran else "C").copy(order="K")
+    elif data:
+        array[:] = np.frombuffer(bytes(data), kind.dtype)
+    array = array.reshape(shape, order="F" if fortran else "C")
     if array.dtype.kind == "U":
         array.tolist()  # raises an error if a number is not a character
     return array
@@ -100,26 +91,14 @@ def _scalar(kind: Any, data: Any) -> Any:
     return _array((), kind, False, data)[()]
 
 
-def _encode(text: Any, encoding: Any) -> bytes:
-    """Replacement of `_codecs.encode`, with which old protocols write bytes; others run zlib."""
-    if encoding != "latin1" or not isinstance(text, str):
-        raise pickle.UnpicklingError(f"_codecs.encode to {str(encoding)[:40]!r}")
-    return text.encode("latin1")
-
-
-#: All names that a pickle of arrays of NumPy 1 or 2 needs. No value is NumPy's own.
+#: All names that a file of arrays of NumPy 1 or 2 needs. No value is NumPy's own.
 _ALLOWED = {
     ("numpy", "ndarray"): _StandIn(_Array),
     ("numpy", "dtype"): _StandIn(_Type),
-    ("_codecs", "encode"): _StandIn(_encode),
     **{
-        (f"numpy.{core}.{module}", name): _StandIn(make)
+        (f"numpy.{core}.multiarray", name): _StandIn(make)
         for core in ("core", "_core")
-        for module, name, make in (
-            ("multiarray", "_reconstruct", _Array),
-            ("multiarray", "scalar", _scalar),
-            ("numeric", "_frombuffer", _buffered),
-        )
+        for name, make in (("_reconstruct", _Array), ("scalar", _scalar))
     },
 }
 
@@ -135,7 +114,7 @@ class _PlainUnpickler(pickle.Unpickler):
 
 def _plain(value: Any, made: dict[int, Any]) -> Any:
     """Return a value with its arrays created; an object shared in the pickle is created once."""
-    if value is None or isinstance(value, str | bytes | bytearray | int | float | np.generic):
+    if value is None or isinstance(value, str | bytes | int | float | np.generic):
         return value
     if id(value) not in made:
         if isinstance(value, dict):

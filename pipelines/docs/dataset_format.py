@@ -116,9 +116,9 @@ reads the files as a whole. `drakegrasp assemble` rebuilds the three files from 
 does so by itself if they do not match the present shards and manifest. A list of
 rejected trials (`assemble --reject`) is kept in the manifest until the next `assemble`.
 
-The three files and the manifest are replaced together: while `replacement.json` is in the directory
-they are in two different states, and every reader rejects them. The next command that uses OUT
-completes the replacement.
+New files get their names one after the other, and the manifest is the last. A process that is
+killed meanwhile leaves files without the `signature` of the manifest: `drakegrasp check` reports
+them, and the next build or `assemble` writes them again.
 
 ## An untrusted dataset
 

@@ -407,7 +407,7 @@ def files(out: Path) -> list[Path]:
 def every_kind(out: Path) -> list[tuple[Path, str]]:
     """Return each file that commands read separately, with each kind that may replace it."""
     parts = [next(iter(sorted(out.glob(name)))).relative_to(out) for name in PARTS]
-    named = map(Path, ("manifest.json", *COLUMNS[:2], "reject.json", "replacement.json"))
+    named = map(Path, ("manifest.json", *COLUMNS[:2], "reject.json"))
     return [(name, kind) for name in (*named, *parts) for kind in KINDS]
 
 

@@ -7,8 +7,8 @@
 `disk`, which needs root, runs a build and `assemble` in a file system in memory (tmpfs) that
 becomes full at a different moment each time: each must end with exit code 1 and one line, and keep
 the previous files. `kills` ends the client of a build with SIGKILL at random moments, in each round
-twice while it prepares, twice while it simulates and twice while it assembles: the files must be in
-one consistent state at any time, and no temporary file may be left at the end. Both print a line of
+twice while it prepares, twice while it simulates and twice while it assembles: the files must be of
+one state, or be told not to be, and no temporary file may be left at the end. Both print a line of
 JSON for each interruption; the exit code is 1 if any is wrong.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
@@ -33,6 +33,7 @@ import numpy as np
 import trimesh
 
 from drakegrasp.dataset.lock import tidy
+from drakegrasp.dataset.statistics import is_assembled
 
 DATA = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
 PAGE, ROOM = 4096, 2**31
@@ -236,13 +237,13 @@ def has_newer(out: Path, pattern: str, since: float) -> bool:
 
 
 def has_one_state(out: Path) -> bool:
-    """Return whether all of the three files or none exist, and were made from the same shards."""
+    """Return whether the files are of one state, or the manifest tells that they are not."""
     there = [out / name for name in DATA if (out / name).exists()]
     states = set()
     for path in there:
         with h5py.File(path) as file:
             states.add((file.attrs["signature"], file.attrs["shards"]))
-    return len(there) in (0, len(DATA)) and len(states) <= 1
+    return (len(there) in (0, len(DATA)) and len(states) <= 1) or not is_assembled(out)
 
 
 def children(client: int) -> list[int]:
@@ -268,7 +269,7 @@ def runs(pid: int) -> bool:
 
 def leftovers(out: Path) -> list[str]:
     """Return the files of a dataset that may exist only while a build is running."""
-    patterns = (".*.tmp", "*.journal", "build.lock", "replacement.json")
+    patterns = (".*.tmp", "*.journal", "build.lock")
     return sorted(path.name for pattern in patterns for path in out.rglob(pattern))
 
 

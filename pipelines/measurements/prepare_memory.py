@@ -6,13 +6,12 @@
 Each mesh is prepared in a separate process. Balls of 10 cm diameter are written as STL, OBJ and PLY
 (`stl`, `obj`, `ply`), and as PLY with noise and six holes (`open`). The script prints a line of
 JSON for each: the peak memory before and in total, the memory that `drakegrasp audit` forecasts,
-and the seconds. The processes use jemalloc if it is installed, as workers do.
+and the seconds.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -21,8 +20,6 @@ from pathlib import Path
 import click
 import numpy as np
 import trimesh
-
-from drakegrasp.runtime.allocator import jemalloc_environment
 
 KINDS = ("stl", "obj", "ply", "open")
 RADIUS = 0.05
@@ -68,7 +65,6 @@ def ball(subdivisions: int, kind: str) -> trimesh.Trimesh:
 @click.option("--kind", "kinds", multiple=True, type=click.Choice(KINDS), default=KINDS)
 def main(subdivisions: tuple[int, ...], kinds: tuple[str, ...]) -> None:
     """Run the script."""
-    environment = {**os.environ, **jemalloc_environment()}
     for number in subdivisions:
         for kind in kinds:
             with tempfile.TemporaryDirectory() as folder:
@@ -76,8 +72,6 @@ def main(subdivisions: tuple[int, ...], kinds: tuple[str, ...]) -> None:
                 mesh = ball(number, kind)
                 mesh.export(path)
                 command = [sys.executable, "-c", _CHILD, str(path), str(len(mesh.faces))]
-                child = subprocess.run(
-                    command, env=environment, capture_output=True, text=True, check=True
-                )
+                child = subprocess.run(command, capture_output=True, text=True, check=True)
             line = {"kind": kind, "faces": len(mesh.faces), **json.loads(child.stdout)}
             click.echo(json.dumps(line))

@@ -10,7 +10,7 @@ cd "$(dirname "$0")/../.."
 keys=${KEYS:-keys}
 
 python pipelines/submit_build.py \
-    --cluster scheduler-file "${SCHEDULER_FILE:-scheduler.json}" \
+    --scheduler-file "${SCHEDULER_FILE:-scheduler.json}" \
     --tls-ca-file "$keys/ca.pem" --tls-cert "$keys/cert.pem" --tls-key "$keys/key.pem" \
     --objects "${MESHES:-builtin}" --units "${UNITS:-m}" --out "${OUT:?directory of the dataset}" \
     "$@"

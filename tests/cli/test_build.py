@@ -26,22 +26,18 @@ from helpers.tiers import in_second_tier
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES
-from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import MachineError
 from drakegrasp.generation.counts import Counts
 from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime import files as file_set
 from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.trial import TrialRecord
 
 FILES = (OTO, OTM, TRIALS)
-#: Assembling renames what a task made and the list of new files, and only then the files, the card
-#: and the manifest.
-LISTED = 2
-RENAMES = LISTED + len(FILES) + len(CARD_FILES) + 1
+#: Assembling gives the files their names, then the card, and last the manifest.
+LAST = len(FILES) + len(CARD_FILES)
 #: A filter that would remove every sample.
 SLIPPED = ("--set", f"filters.max_slip={SLIP / 2}")
 
@@ -126,7 +122,8 @@ def test_assemble_that_works_keeps_its_filters(out: Path) -> None:
     assert read_manifest(out).config.filters.max_slip == SLIP / 2
 
 
-#: Assembles copies of a dataset without samples, and dies at the rename that is the copy's name.
+#: Assembles copies of a dataset without samples, and dies when the file of the number that is the
+#: copy's name should get its name.
 DIE = """
 import os, signal, sys
 from pathlib import Path
@@ -136,12 +133,13 @@ from drakegrasp.dataset.assemble import assemble
 rename, (setting, *copies) = os.replace, sys.argv[1:]
 for copy in copies:
     left = int(Path(copy).name)
-    def replace(*names, **options):
+    def replace(old, new, **options):
         global left
-        if not left:
-            os.kill(os.getpid(), signal.SIGKILL)
-        left -= 1
-        rename(*names, **options)
+        if Path(new).parent == Path(copy) and not Path(new).name.startswith("."):
+            if not left:
+                os.kill(os.getpid(), signal.SIGKILL)
+            left -= 1
+        rename(old, new, **options)
     child = os.fork()
     if not child:
         os.replace = replace
@@ -151,8 +149,8 @@ for copy in copies:
 
 
 #: The renames at which assembling is killed in the first tier, and the others.
-FIRST = (0, LISTED, LISTED + 1, RENAMES - 1)
-OTHERS = tuple(k for k in range(RENAMES) if k not in FIRST)
+FIRST = (0, 2, LAST)
+OTHERS = tuple(k for k in range(LAST) if k not in FIRST)
 
 
 @pytest.fixture(scope="module")
@@ -184,35 +182,24 @@ def samples(out: Path) -> list[int]:
     return [*counts, 0 if read_manifest(out).config.filters.max_slip == SLIP / 2 else 3]
 
 
-@pytest.mark.parametrize(
-    ("command", "rename"),
-    [
-        *(("stats", k) for k in (0, LISTED, RENAMES - 1)),
-        *((command, LISTED + 1) for command in ("check", "assemble")),
-        *(in_second_tier(("stats", k)) for k in (*OTHERS, LISTED + 1)),
-    ],
-)
-def test_files_appear_together_whenever_assembling_is_killed(
-    killed: Callable[[int], Path],
-    tmp_path: Path,
-    rename: int,
-    command: str,
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("rename", [*FIRST, *map(in_second_tier, OTHERS)])
+def test_files_are_of_one_state_or_told_whenever_assembling_is_killed(
+    killed: Callable[[int], Path], tmp_path: Path, rename: int
 ) -> None:
-    """A reader refuses what is half done, and the next command completes it."""
-    monkeypatch.setattr(file_set, "PATIENCE", 0.1)
+    """The manifest is the last: while it is the old one, new files are told."""
     out = Path(shutil.copytree(killed(rename), tmp_path / "out"))
-
-    # Before the list of new files has its name, the old files count.
-    if rename >= LISTED:
-        with pytest.raises(DataError, match=r"drakegrasp stats .* completes this"):
-            GraspDataset(out / OTO)
-    else:
+    assert run("stats", out).exit_code == 0
+    if rename == 0:
         assert samples(out) == [3] * 4
+    else:
+        result = run("check", out)
+        assert result.exit_code == 1
+        assert f"{TRIALS}: attribute signature must be that of manifest.json" in result.stdout
 
-    # The next command leaves files of one state, and nothing else.
-    assert run(command, out).exit_code == 0
-    assert samples(out) == ([0] * 4 if rename >= LISTED else [3] * 4)
+    # Assembling leaves files of one state, and nothing else.
+    assert run("assemble", out).exit_code == 0
+    assert samples(out) == [3] * 4
+    assert run("check", out).exit_code == 0
     whole = ["manifest.json", "objects", "shards", *FILES, *CARD_FILES]
     assert sorted(os.listdir(out)) == sorted(whole)
 

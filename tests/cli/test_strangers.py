@@ -44,7 +44,8 @@ def test_lock_that_is_a_link_is_not_written(
     victim = tmp_path / "profile"
     victim.write_text("mine\n")
     how(victim, out / "build.lock")
-    assert "build.lock: must be a file of its own, got a link" in refusal("assemble", out)
+    told = refusal("assemble", out)
+    assert "must be a file of its own, got a link" in told or "symbolic links" in told
     assert run("stats", out).exit_code == 0
     assert victim.read_text() == "mine\n"
 
@@ -116,11 +117,6 @@ def test_other_kind_of_file_is_neither_waited_for_nor_read(out: Path, kind: str,
     assert f"{name}: " in refusal("stats", out) and said in refusal("stats", out)
 
 
-def test_list_of_replaced_files_that_is_a_pipe_is_not_waited_for(out: Path) -> None:
-    os.mkfifo(out / "replacement.json")
-    assert "a pipe" in refusal("assemble", out)
-
-
 def test_card_that_is_a_pipe_is_not_waited_for(out: Path) -> None:
     (out / "DATACARD.json").unlink()
     os.mkfifo(out / "DATACARD.json")
@@ -166,15 +162,6 @@ def test_names_in_a_manifest_are_names(out: Path, name: str) -> None:
     edit_manifest(out, lambda tree: tree["objects"][0].update(name=name))
     for command in ("stats", "assemble", "check"):
         assert "a name must be printable" in refusal(command, out)
-
-
-def test_list_of_replaced_files_names_files_of_its_folder(out: Path, tmp_path: Path) -> None:
-    (tmp_path / "profile").write_text("mine\n")
-    for listed in ({"../profile": ".x.tmp"}, {TRIALS: "manifest.json"}, {TRIALS: "../profile"}):
-        (out / "replacement.json").write_text(json.dumps(listed))
-        assert "replacement.json: must be a list of files" in refusal("assemble", out)
-    assert (out / "manifest.json").exists()
-    assert (tmp_path / "profile").read_text() == "mine\n"
 
 
 def _soft(file: h5py.File, place: str, secret: Path) -> None:

@@ -1,4 +1,4 @@
-"""Real clusters: SLURM and SSH, of this machine alone. Run by `make test-cluster`, as root."""
+"""A real SLURM, of this machine alone. Run by `make test-cluster`, as root."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from distributed import Client
 from helpers.assertions import assert_same_dataset
@@ -19,7 +18,6 @@ from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES
 from server.processes import wait_until
 from server.slurm import PARTITION, queued_jobs, running_slurm
-from server.ssh import running_sshd
 
 from drakegrasp.cluster import jobqueue as jobs
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
@@ -75,12 +73,6 @@ def slurm() -> Iterator[dict[str, str]]:
         yield {**env, "DASK_CONFIG": str(folder), "SBATCH_EXPORT": "NONE"}
 
 
-@pytest.fixture(scope="module")
-def ssh() -> Iterator[dict[str, str]]:
-    with tempfile.TemporaryDirectory(prefix="ssh-") as name, running_sshd(Path(name)) as env:
-        yield env
-
-
 def submit(env: dict[str, str], meshes: Path, out: Path, *arguments: str) -> None:
     command = [sys.executable, PIPELINES / "submit_build.py", "--objects", meshes, "--out", out]
     options = ["--candidates", str(CANDIDATES), "--set", f"unit_candidates={UNIT}", *arguments]
@@ -109,7 +101,6 @@ def settings(client: Client) -> dict[str, dict[str, Any]]:
             "start": get("distributed.worker.multiprocessing-method"),
             "profile": get("distributed.worker.profile.enabled"),
             "threads": dask_worker.state.nthreads,
-            "lifetime": dask_worker.lifetime,
             "yaml": os.environ.get("FROM_YAML"),
             "address": dask_worker.address,
         }
@@ -129,16 +120,6 @@ def check_settings(client: Client, count: int, scheme: str) -> None:
         return float(dask_scheduler.WORKER_SATURATION)
 
     assert client.run_on_scheduler(saturation) == 1.0
-
-
-def remote_processes() -> list[psutil.Process]:
-    """Return the processes of Dask that sshd or slurmd started, and that are still there."""
-    found = []
-    for process in psutil.process_iter(["cmdline"]):
-        line = " ".join(process.info["cmdline"] or [])
-        if "distributed.cli.dask_spec" in line or "distributed.cli.dask_worker" in line:
-            found.append(process)
-    return found
 
 
 def test_slurm_builds_what_a_plain_loop_builds(
@@ -169,7 +150,6 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
         check_settings(client, 3, "tcp")
         for worker in settings(client).values():
             assert worker["yaml"] == "1"
-            assert 780.0 <= worker["lifetime"] <= 1020.0  # 20 min - 5 min +- 2 min
         before = queued_jobs(slurm)
         subprocess.run(["scancel", before[0]], env=slurm, check=True)
         end = time.monotonic() + PATIENCE
@@ -216,39 +196,6 @@ def test_slurm_refuses_a_job_in_one_line(
     )
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
-    assert line.startswith("error: SLURM does not accept the job: ")
-    assert not (tmp_path / "out").exists()
-
-
-def test_ssh_builds_what_a_plain_loop_builds(
-    ssh: dict[str, str], meshes: Path, built_here: Path, out: Path
-) -> None:
-    submit(ssh, meshes, out, "--cluster", "ssh", "127.0.0.1", "--workers", "2")
-    assert_same_dataset(built_here, out)
-    wait_until(lambda: not remote_processes(), "the end of the workers", out / "none")
-
-
-def test_ssh_workers_have_their_settings(
-    ssh: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HOME", ssh["HOME"])
-    for name in WORKER_ENVIRONMENT:
-        monkeypatch.delenv(name, raising=False)
-    cluster = cluster_of("ssh", where=("127.0.0.1", "127.0.0.1"), workers=2)
-    with cluster.connected(tmp_path) as client:
-        client.wait_for_workers(2, timeout=PATIENCE)
-        check_settings(client, 2, "tls")
-    wait_until(lambda: not remote_processes(), "the end of the workers", tmp_path / "none")
-
-
-def test_ssh_host_that_is_not_there_is_one_line(
-    ssh: dict[str, str], meshes: Path, tmp_path: Path
-) -> None:
-    command = [sys.executable, PIPELINES / "submit_build.py", "--objects", meshes]
-    # Another loopback address: nothing in the user's ~/.ssh says anything of it.
-    options = ["--out", tmp_path / "out", "--cluster", "ssh", "127.0.0.2", "--cores", "1"]
-    result = subprocess.run([*command, *options], env=ssh, capture_output=True, text=True)
-    assert result.returncode == 1
-    (line,) = result.stderr.splitlines()
     assert line.startswith("error: the workers did not start: ")
+    assert "Requested node configuration is not available" in line or "Memory" in line
     assert not (tmp_path / "out").exists()

@@ -10,7 +10,6 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,9 +29,9 @@ import drakegrasp
 from drakegrasp import registry
 from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.certificates import make_certificates, private_directory, security_of
-from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, dask_settings
-from drakegrasp.cluster.jobqueue import _exports, walltime_seconds
+from drakegrasp.cluster.certificates import made_or_given, make_certificates
+from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect
+from drakegrasp.cluster.jobqueue import Jobs
 from drakegrasp.cluster.kinds import Local, cluster_of
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.generation.pipeline import build
@@ -65,12 +64,10 @@ def dry_run(out: Path, *arguments: str | Path) -> Result:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--workers", "3"], "workers on this machine"),
-        (["--cluster", "ssh", "127.0.0.1", "--cores", "3"], "3 workers over ssh on 127.0.0.1"),
-        (
-            ["--cluster", "ssh", "a", "b", "a", "--workers", "3", "--interface", "ib0"],
-            "3 workers over ssh on a b, scheduler on a",
-        ),
+        (["--workers", "3"], "3 workers on this machine"),
+        (["--scheduler", "tls://a:1"], "the workers of tls://a:1"),
+        (["--scheduler-file", "a.json"], "the workers of a.json"),
+        (["--cluster", "slurm", "--workers", "3"], "3 workers in 3 slurm jobs (1 in each)"),
     ],
 )
 def test_dry_run_says_what_would_run_and_makes_nothing(
@@ -85,31 +82,20 @@ def test_dry_run_says_what_would_run_and_makes_nothing(
     assert not out.exists()
 
 
-def test_a_dry_run_needs_no_address_of_the_scheduler(tmp_path: Path) -> None:
-    """It says that one is missing; without --dry-run that is an error."""
-    words = ["--cluster", "ssh", "a", "--cores", "2"]
-    said, refused = "--interface NAME or --host ADDRESS must be given", tmp_path / "out"
-    result = dry_run(refused, *words)
-    assert (result.exit_code, f"note: {said}" in result.stdout) == (0, True)
-    result = run("--objects", "builtin", "--out", refused, *words)
-    assert (result.exit_code, f"error: {said}" in result.stderr) == (2, True)
-
-
 def test_open_port_is_warned_of(tmp_path: Path) -> None:
-    ssh = ["--cluster", "ssh", "a", "--cores", "1", "--host", "10.0.0.1"]
-    said = dry_run(tmp_path / "out", *ssh, "--no-tls").stdout
+    jobs = ["--cluster", "slurm", "--workers", "1"]
+    said = dry_run(tmp_path / "out", *jobs, "--no-tls").stdout
     assert "connections: not encrypted" in said
     assert "can run programs as you" in said
-    for given in (ssh, [*ssh, "--tls"], ["--workers", "1"]):
+    for given in (jobs, [*jobs, "--tls"], ["--workers", "1"]):
         said = dry_run(tmp_path / "out", *given).stdout
         assert "connections: TLS" in said
         assert "warning" not in said
 
 
-@pytest.mark.parametrize("kind", ["ssh", "slurm"])
 @pytest.mark.parametrize("choice", ["made", "own", "none"])
 def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, choice: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, choice: str
 ) -> None:
     own = make_certificates(tmp_path) if choice == "own" else None
 
@@ -123,11 +109,8 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
             assert security.tls_ca_file == str(kept)
         raise MachineError("started")
 
-    monkeypatch.setattr(registry.find("clusters", kind), "start", start)
-    where = ("node",) if kind == "ssh" else ()
-    cluster = cluster_of(
-        kind, where=where, workers=1, host="10.0.0.1", tls=choice != "none", tls_files=own
-    )
+    monkeypatch.setattr(Jobs, "_start", start)
+    cluster = cluster_of("slurm", workers=1, tls=choice != "none", tls_files=own)
     with pytest.raises(MachineError, match="started"), cluster.connected(tmp_path / "out"):
         pass
     assert not list(tmp_path.glob("out/.tls-*"))
@@ -137,32 +120,18 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
     ("arguments", "words"),
     [
         (["--workers", "0"], "workers must be at least 1, got 0"),
-        (["--cluster", "ssh"], "must be followed by the names of the hosts, got nothing"),
-        (["--cluster", "ssh", "a", "b"], "--workers or --cores must be given"),
-        (["--cluster", "ssh", "a", "b", "--workers", "3"], "must be a multiple of"),
-        (
-            ["--cluster", "ssh", "a", "b", "--cores", "4", "--workers", "9"],
-            "--workers must be --cores times the number of hosts, 8, or not be given, got 9",
-        ),
         (["--cluster", "moab"], "error: Invalid value for '--cluster': 'moab' is not one of"),
-        (["--scheduler", "tls://a:1", "--cluster", "ssh", "a"], "--scheduler must be used without"),
-        (["--address", "tls://a:1", "--cluster", "ssh", "a"], "--scheduler must be used without"),
+        (["--scheduler", "tls://a:1", "--cluster", "slurm"], "--scheduler must be used without"),
+        (["--scheduler", "tls://a:1", "--workers", "2"], "--workers must not be given"),
+        (["--scheduler", "tcp://a:1"], "must have an address that begins with tls://"),
+        (["--scheduler", "x", "--no-tls", *OWN], "must not be given with certificates"),
         (["--with", "image=x"], "--with must be left out for --cluster local, got 'image=x'"),
-        (["--cluster", "ssh", "me@a", "--cores", "2", "--host", "x"], "go into ~/.ssh/config"),
-        (["--cluster", "ssh", "a;b", "--cores", "2", "--host", "x"], "a host must be a name or"),
-        (["--cluster", "ssh", "a", "--cores", "2", "--host", "$(b)"], "host must be a name or an"),
-        (["--cluster", "ssh", "a", "--cores", "2", "--interface", "-x"], "interface must be a na"),
-        (["--cluster", "scheduler"], "must be followed by its address"),
-        (["--cluster", "scheduler", "tcp://a:1", "--workers", "2"], "--workers must not be given"),
-        (["--cluster", "local", "node1"], "must be followed by nothing, got node1"),
         (["--cluster", "local", "--walltime", "1:00:00"], "--walltime must not be given"),
         (["--cluster", "local", "--memory", "much"], "memory must be a size such as 2GB"),
-        (["--cluster", "slurm", "--walltime", "soon", "--workers", "1"], "must be a time of SLURM"),
         (["--cluster", "slurm"], "--workers must be given"),
+        (["--cluster", "slurm", "--workers", "3", "--cores", "0"], "cores must be at least 1"),
         (["--tls-cert", __file__], "must be given together"),
         (["--no-tls"], "must not be given for workers on this machine"),
-        (["--cluster", "scheduler", "x", "--no-tls", *OWN], "must not be given with certificates"),
-        (["--cluster", "scheduler", "tcp://a:1"], "must have an address that begins with tls://"),
         (["--set", "lift.speed=1"], "lift.speed: must be a known key"),
     ],
 )
@@ -178,27 +147,12 @@ def test_bad_options_are_one_line_and_make_nothing(
     assert not out.exists()
 
 
-def test_dask_gets_no_quotation_mark_for_its_commands_over_ssh(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cluster = cluster_of("ssh", where=("a",), cores=1, host="10.0.0.1")
-    (tmp_path / "it's").mkdir()
-    security = security_of(make_certificates(tmp_path / "it's"))
-    with pytest.raises(ConfigError, match=r"must be without ', got .*it's"):
-        cluster.start(security)
-    monkeypatch.setenv("OPENBLAS_CORETYPE", "a'; touch ran; '")
-    with pytest.raises(ConfigError, match="OPENBLAS_CORETYPE must be without ', got a'; touch"):
-        cluster.start(None)
-
-
 def test_kind_of_another_package_has_settings_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    @dataclass(kw_only=True)
     class Pods(Local):
-        image: str
+        settings = ("image",)
 
     monkeypatch.setattr(registry, "find", lambda *_: Pods)
-    cluster = cluster_of("pods", ["image=a;b=$(c)"])
-    assert isinstance(cluster, Pods) and cluster.image == "a;b=$(c)"
+    assert cluster_of("pods", ["image=a;b=$(c)"]).own == {"image": "a;b=$(c)"}
     for text in ("size=1", "image=", "image", "workers=2"):
         with pytest.raises(ConfigError) as told:
             cluster_of("pods", [text])
@@ -207,44 +161,17 @@ def test_kind_of_another_package_has_settings_of_its_own(monkeypatch: pytest.Mon
         )
 
 
-@pytest.mark.parametrize(
-    ("text", "seconds"),
-    [
-        ("30", 1800.0),
-        ("30:15", 1815.0),
-        ("1:30:00", 5400.0),
-        ("2-0", 172800.0),
-        ("1-12:30", 131400.0),
-        ("1-00:00:01", 86401.0),
-    ],
-)
-def test_walltimes_are_those_of_slurm(text: str, seconds: float) -> None:
-    assert walltime_seconds(text) == seconds
-
-
-def test_settings_survive_a_job_script() -> None:
-    """A shell that runs the lines of the script gives Dask the same settings."""
-    probe = f"import dask, json; print([dask.config.get(k) for k in {list(dask_settings())!r}])"
-    script = "\n".join([*_exports(), f"exec '{sys.executable}' -c \"$0\""])
-    result = subprocess.run(
-        ["bash", "-c", script, probe], capture_output=True, text=True, env={}, check=True
-    )
-    found = ast.literal_eval(result.stdout)
-    for (key, wanted), got in zip(dask_settings().items(), found, strict=True):
-        assert (got | wanted if isinstance(wanted, dict) else wanted) == got, key
-
-
 def test_keys_are_private_and_removed(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    dead = out / ".tls-dead"  # of a client that was killed
-    dead.mkdir(parents=True)
+    dead = tmp_path / ".tls-dead"  # of a client that was killed
+    dead.mkdir()
     make_certificates(dead)
-    with private_directory(out) as folder:
-        assert list(out.iterdir()) == [folder]
-        files = make_certificates(folder)
+    with made_or_given(True, None, tmp_path) as security:
+        assert security is not None
+        (folder,) = tmp_path.iterdir()
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-        assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
-    assert not out.exists()
+        assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
+        assert security.tls_ca_file == str(folder / "ca.pem")
+    assert not list(tmp_path.iterdir())
 
 
 def test_script_makes_certificates_in_a_new_folder_of_its_own(tmp_path: Path) -> None:
@@ -327,8 +254,8 @@ def test_scheduler_with_tls_refuses_a_client_without_a_certificate(
     strange = make_certificates(tmp_path)
     options = ["--tls-ca-file", strange[0], "--tls-cert", strange[1], "--tls-key", strange[2]]
     for given in ([], options):
-        arguments = ["--objects", box, "--out", tmp_path / "out", "--cluster", "scheduler"]
-        result = run(*arguments, address, *given)
+        arguments = ["--objects", box, "--out", tmp_path / "out", "--scheduler", address]
+        result = run(*arguments, *given)
         assert result.exit_code == 1
         assert "must be a running Dask scheduler" in result.stderr.splitlines()[-1]
     assert local.submit(int, 7).result() == 7
@@ -419,11 +346,10 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     join = [*command, "distributed.cli.dask_worker", *tls, "--scheduler-file", str(file)]
     worker = subprocess.Popen([*join, "--nthreads", "1"], env=plain, stderr=subprocess.DEVNULL)
     try:
-        cluster = cluster_of("scheduler-file", where=(str(file),), tls_files=files)
         while not file.exists():
             scheduler.poll()
             assert scheduler.returncode is None
-        with cluster.connected(tmp_path) as client:
+        with connect(scheduler_file=file, tls_files=files) as client:
             client.wait_for_workers(1, timeout=60)
             with admitted_workers(client, load_config()):
                 assert client.run_on_scheduler(saturation) == 1.0

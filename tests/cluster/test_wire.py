@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import trimesh
 from distributed import Client, LocalCluster, Worker
+from helpers import faults
 from helpers.builds import FAST
 from helpers.file_tasks import Join, join
 from helpers.tiers import in_second_tier
@@ -285,7 +286,7 @@ def test_attempt_that_crashes_its_process_costs_itself_alone(
 ) -> None:
     config, here = load_config(overrides=FAST), tmp_path / "here"
     build(find_meshes(meshes), here, config, run_here, show=False)
-    monkeypatch.setenv(VARIABLE, "crash:1_box_a:3:1")
+    monkeypatch.setenv(VARIABLE, faults.setting("crash:1_box_a:3:1"))
     build_by_wire(client, meshes, out, config)
     with h5py.File(here / "trials.hdf5") as one, h5py.File(out / "trials.hdf5") as other:
         expected, found = (file["trials/outcome"][:] for file in (one, other))

@@ -552,7 +552,7 @@ def write_pickle(path: Path, content: Any, protocol: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("protocol", [3, 4])
 def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
     evil = dexgraspbench(obj_scale=Evil(tmp_path / "ran"))
     path = write_pickle(tmp_path / "0.npy", evil, protocol)
@@ -561,12 +561,10 @@ def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
     assert not (tmp_path / "ran").exists()
 
 
-def test_pickles_of_every_protocol_are_read(tmp_path):
-    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+def test_pickles_of_the_protocols_of_numpy_are_read(tmp_path):
+    for protocol in (3, 4):
         write_pickle(tmp_path / f"{protocol}.npy", dexgraspbench(), protocol)
-    np.testing.assert_array_equal(
-        read_attempts(tmp_path, HAND).q_grasp, GRASP[[0] * (protocol + 1)]
-    )
+    np.testing.assert_array_equal(read_attempts(tmp_path, HAND).q_grasp, GRASP[[0, 0]])
 
 
 @pytest.mark.parametrize(

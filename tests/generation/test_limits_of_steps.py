@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
+from helpers import faults
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh, read_manifest
@@ -20,7 +20,7 @@ from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes, source_sha256
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS, VARIABLE
+from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow, pytest.mark.nightly]
 
@@ -46,7 +46,7 @@ def die(function: object, task: object, fault: str, times: int, seconds: float) 
     run = subprocess.run(
         [sys.executable, "-c", CHILD, str(times), str(seconds)],
         input=pickle.dumps((function, task)),
-        env={**os.environ, VARIABLE: fault},
+        env=faults.environment(fault),
         capture_output=True,
         check=True,
         timeout=120,

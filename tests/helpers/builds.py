@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import signal
 import subprocess
@@ -10,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from drakegrasp.runtime.journal import VARIABLE
+from helpers import faults
 
 #: Six units of half a second for each object, so that none goes with another and a build can be
 #: stopped in time; of six attempts one succeeds.
@@ -50,7 +49,7 @@ def start_build(
         out: Directory of the dataset.
         workers: Number of workers.
         *arguments: More of them.
-        fault: What goes wrong, see `drakegrasp.runtime.journal`.
+        fault: What goes wrong, see `helpers.faults`.
         largest_file: Size of the largest file that can be written [B].
         new_session: Whether it has a terminal of its own, as it were: a group of processes.
     """
@@ -71,7 +70,7 @@ def start_build(
     for value in FAST:
         command += ["--set", value]
     command += arguments
-    environment = {**os.environ, VARIABLE: fault} if fault else None
+    environment = faults.environment(fault) if fault else None
     return subprocess.Popen(
         command,
         stdout=subprocess.PIPE,

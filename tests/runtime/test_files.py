@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -15,18 +14,14 @@ from helpers.shards import some_shard
 from drakegrasp.dataset.hdf5 import write_field
 from drakegrasp.dataset.schema import Field
 from drakegrasp.dataset.shards import write_shard
-from drakegrasp.errors import DataError
 from drakegrasp.runtime import files
 from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.files import (
-    LIST_NAME,
     atomic_folder,
     atomic_hdf5,
-    complete_replacement,
     probe_folder,
     replaced_together,
     sweep_temporary,
-    temporary_name,
     write_atomic,
 )
 
@@ -118,33 +113,37 @@ def test_file_is_on_the_disk_before_it_has_its_name(
     assert second == tmp_path and named
 
 
-def test_files_that_are_replaced_together_are_on_the_disk_before_their_list(
+def test_files_that_are_replaced_together_are_on_the_disk_before_the_first_has_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    synced, listed = watch_sync(monkeypatch), tmp_path / LIST_NAME
+    synced = watch_sync(monkeypatch)
     with replaced_together(tmp_path) as new:
-        for name in ("a", "b"):
+        for name in ("b", "a"):
             new(name).write_text(name)
-    before = [path.name for path, seen in synced if listed not in seen]
-    assert [name[:3] for name in before[:2]] == [".a.", ".b."]
-    # The names are on the disk before the list goes, and then that it went.
-    *_, (last, seen), (end, left) = synced
-    assert last == end == tmp_path
-    assert listed in seen and {tmp_path / "a", tmp_path / "b"} <= seen
-    assert listed not in left
+    (first, before), (second, still), (end, seen) = synced
+    assert [first.name[:3], second.name[:3], end] == [".b.", ".a.", tmp_path]
+    assert not {tmp_path / "a", tmp_path / "b"} & (before | still)
+    assert {tmp_path / "a", tmp_path / "b"} == seen
     assert [(tmp_path / name).read_text() for name in ("a", "b")] == ["a", "b"]
 
 
-def test_list_of_what_is_no_file_is_refused(tmp_path: Path) -> None:
-    """A folder or a link of the right name must not replace a file."""
-    (tmp_path / "file").write_text("old")
-    for make in (Path.mkdir, lambda path: path.symlink_to(tmp_path / "file")):
-        new = temporary_name(tmp_path / "file")
-        make(new)
-        (tmp_path / LIST_NAME).write_text(json.dumps({"file": new.name}))
-        with pytest.raises(DataError, match=r"must be a list of files .*, which is no file"):
-            complete_replacement(tmp_path)
-        assert (tmp_path / "file").read_text() == "old"
+def test_files_get_their_names_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    named, rename = list[str](), Path.replace
+    monkeypatch.setattr(
+        Path, "replace", lambda path, to: (named.append(to.name), rename(path, to))[1]
+    )
+    with replaced_together(tmp_path) as new:
+        for name in ("z", "a", "m"):
+            new(name).write_text(name)
+    assert named == ["z", "a", "m"]
+
+
+def test_error_while_files_are_written_keeps_those_that_were_there(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("old")
+    with pytest.raises(KeyboardInterrupt), replaced_together(tmp_path) as new:
+        new("a").write_text("new")
+        raise KeyboardInterrupt
+    assert [path.read_text() for path in everything_in(tmp_path)] == ["old"]
 
 
 def watch_sync(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, set[Path]]]:

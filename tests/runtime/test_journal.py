@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import faults
 from helpers.tiers import few, in_second_tier
 
 from drakegrasp.runtime.journal import (
@@ -29,11 +30,11 @@ from drakegrasp.runtime.journal import (
 UNIT = {"name": "mug", "start": 0, "stop": 10}
 #: A unit of ten steps, as its own process; every argument is a fault, KIND:STEP.
 RUN = """
-import sys, time
+import runpy, sys, time
 from pathlib import Path
 import drakegrasp.runtime.journal as j
-from drakegrasp.runtime.journal import _cause
 from drakegrasp.runtime.journal import open_journal
+happen = runpy.run_path(HELPER)["happen"]
 
 faults = dict(reversed(argument.split(":")) for argument in sys.argv[2:])
 with open_journal(Path(sys.argv[1]), {"name": "mug", "start": 0, "stop": 10}) as journal:
@@ -46,8 +47,8 @@ with open_journal(Path(sys.argv[1]), {"name": "mug", "start": 0, "stop": 10}) as
         with journal.step(step, 0.2):
             print(step, "runs", flush=True)
             if step in faults:
-                _cause(faults[step])
-"""
+                happen(faults[step])
+""".replace("HELPER", repr(faults.__file__))
 
 
 def with_wall_factor(factor: float) -> str:
@@ -120,7 +121,7 @@ def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> N
     """Neither a stop beyond the limit of computing time, nor one beyond that of the wall clock."""
     path = tmp_path / "journal"
     # The step waits for a line, so that the process is surely stopped within it.
-    wait = RUN.replace("_cause(faults[step])", "sys.stdin.readline()")
+    wait = RUN.replace("happen(faults[step])", "sys.stdin.readline()")
     process = subprocess.Popen(
         [sys.executable, "-c", wait, path, "wait:try 4"],
         stdin=subprocess.PIPE,

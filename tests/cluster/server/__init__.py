@@ -1,1 +1,1 @@
-"""Real servers for tests, each in a folder of its own, as root: SLURM and sshd."""
+"""A real SLURM for tests, in a folder of its own, as root."""

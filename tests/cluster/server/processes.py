@@ -52,10 +52,3 @@ def wait_until(ready: Callable[[], bool], what: str, log: Path) -> None:
             tail = log.read_text(errors="replace")[-2000:] if log.exists() else ""
             raise TimeoutError(f"{what} must be ready within {PATIENCE:g} s; its log ends: {tail}")
         time.sleep(0.2)
-
-
-def accepts(port: int) -> bool:
-    """Return whether something listens on a port of this machine."""
-    with socket.socket() as probe:
-        probe.settimeout(1.0)
-        return probe.connect_ex(("127.0.0.1", port)) == 0
