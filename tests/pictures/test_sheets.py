@@ -10,12 +10,9 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from doc_figures import find_sample, frames_figure, hero_figure
 from helpers.datasets import MISSING, OTO
 from helpers.machine import needs_egl
-from helpers.scripts import PIPELINES
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import create_field
@@ -134,14 +131,6 @@ def test_samples_are_spread_over_objects() -> None:
     assert spread_over_objects([f"{i}_x" for i in range(9)], 3) == [0, 4, 8]
 
 
-def test_sample_of_an_unknown_trial_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "grasping_oto.hdf5"
-    write_data_file(path, ["1_mug", "2_box"])
-    assert find_sample(path, 11)[0].props["object_name"] == "2_box"
-    with pytest.raises(DataError, match="trial 12"):
-        find_sample(path, 12)
-
-
 def test_examples_of_the_docs_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,43 +148,6 @@ def test_examples_of_the_docs_run(
     np.testing.assert_allclose(space["p_LQ"], P_CQ * [1.0, -1.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(space["X_TL"][:3, 2], [0.0, 0.0, 1.0], atol=1e-6)
     assert f"f = {K[0, 0]:.2f} px, c = {K[0, 2]:.1f} px" in text
-
-
-@pytest.mark.sim
-@needs_egl
-def test_snapshots_show_the_hand_and_the_object(sound: Path, tmp_path: Path) -> None:
-    from trial_pictures import render_trial
-
-    pictures = render_trial(sound, 0, size=(160, 120))
-    assert [p.image.shape for p in pictures] == [(120, 160, 3)] * 3
-    for picture in pictures:
-        assert picture.image.std() > 5.0
-    # The open and the closed hand are seen from one point, the lifted one from another.
-    np.testing.assert_array_equal(pictures[0].X_WC, pictures[1].X_WC)
-    assert np.abs(pictures[0].image.astype(int) - pictures[1].image).max() > 50
-    assert pictures[2].X_WC[2, 3] > pictures[1].X_WC[2, 3]
-    files = [sound / f"grasping_{camera}.hdf5" for camera in ("oto", "otm")]
-    hero_figure(*files, 0, pictures, tmp_path / "hero.png")
-    assert imread(tmp_path / "hero.png").shape[1] > 1000
-
-
-@pytest.mark.sim
-@needs_egl
-def test_figure_of_the_frames_has_them_all(sound: Path, tmp_path: Path) -> None:
-    from trial_pictures import frames_panels
-
-    panels = frames_panels(sound, 0)
-    names = [name for p in panels for name in (*(t.label for t in p.triads), *p.points, *p.arrows)]
-    letters = ["W", "T", "O", "Ocm", "G", "F1", "F2", "F3", "Q1", "Q2", "Q3", "C", "I"]
-    assert set(names) == set(letters)
-    # Every frame's origin is in its picture.
-    for panel in panels:
-        height, width = panel.picture.image.shape[:2]
-        for triad in panel.triads:
-            uv = panel.picture.pixels(triad.X_WA[None, :3, 3])[0]
-            assert np.all((uv >= 0.0) & (uv <= [width, height])), triad.label
-    frames_figure(panels, tmp_path / "frames.png")
-    assert imread(tmp_path / "frames.png").shape[1] > 1000
 
 
 @pytest.mark.sim
@@ -240,7 +192,7 @@ def test_figures_import_no_drake() -> None:
     import subprocess
 
     code = (
-        "import sys, doc_figures, drakegrasp.pictures.sheets; "
+        "import sys, drakegrasp.pictures.sheets; "
         "print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
     )
     found = subprocess.run(
@@ -248,7 +200,6 @@ def test_figures_import_no_drake() -> None:
         capture_output=True,
         text=True,
         check=True,
-        cwd=PIPELINES / "docs",
     )
     assert found.stdout.strip() == "set()"
 
