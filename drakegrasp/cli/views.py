@@ -115,7 +115,6 @@ def export(
     *,
     form: Annotated[str, Named("exporters")],
     licence: str | None = None,
-    about: Path | None = None,
     attempts: Annotated[str | None, click.Choice(["samples", "failed", "all"])] = None,
     fps: Annotated[int | None, click.IntRange(1, 120)] = None,
 ) -> None:
@@ -126,34 +125,21 @@ def export(
     Options:
         --to (form): The format.
         --licence --license ID: Licence that the card of format hf names, e.g. cc-by-4.0.
-        --about YAML: For format hf: name, version, url, creators, published, licence, citation.
         --attempts WHICH: Attempts of format lerobot: samples; failed: the hand closed, but does
             not hold the object; all: samples, failed and held attempts.  [default: samples]
         --fps N: Frames per second of format lerobot.  [default: 10]
         --quiet
     """
-    from drakegrasp.exchange.export import (
-        Publication,
-        export_dataset,
-        not_said,
-        options_of,
-        read_publication,
-    )
+    from drakegrasp.exchange.export import export_dataset, options_of
     from drakegrasp.foreign_files import refuse_link
 
-    # What only some formats take; the option on publishers overrides the file.
+    # What only some formats take.
     known = options_of(form)
-    for option, value, name in (
-        *(("--about", about, "publication"), ("--licence", licence, "publication")),
-        *(("--attempts", attempts, "attempts"), ("--fps", fps, "fps")),
-    ):
-        if value and name not in known:
-            raise click.UsageError(f"{option} must be left out with --to {form}, got {value}")
-    publication = Publication() if about is None else read_publication(about)
-    if licence:
-        publication = publication.model_copy(update={"licence": licence})
-    given = {"publication": publication, "attempts": attempts, "fps": fps}
-    options = {name: given[name] for name in known if given.get(name)}
+    given = {"licence": licence, "attempts": attempts, "fps": fps}
+    options = {name: value for name, value in given.items() if value}
+    for name, value in options.items():
+        if name not in known:
+            raise click.UsageError(f"--{name} must be left out with --to {form}, got {value}")
 
     if directory is None:
         directory = out / f"export_{form}"
@@ -162,5 +148,3 @@ def export(
     with progress_bar("export", f"{counts}s", show=not quiet) as progress:
         count = export_dataset(out, directory, form, progress=progress, **options)
     say(f"{counted(count, counts)} in {directory}")
-    if "publication" in known and (missing := not_said(publication)):
-        say(f"before it is published, --about should say: {', '.join(missing)}")

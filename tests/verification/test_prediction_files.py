@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.contacts import read_contacts, read_numbers
+from drakegrasp.exchange.columns import read_numbers
+from drakegrasp.exchange.contacts import read_contacts
 
 NUMBERS = np.random.default_rng(0).normal(size=(4, 18)).round(6)
 
