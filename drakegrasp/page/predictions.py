@@ -27,7 +27,6 @@ from drakegrasp.dataset.schema import (
     Shown,
     refuse_other_schema,
 )
-from drakegrasp.dataset.trials import Stamp, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -88,7 +87,6 @@ class Predictions(Gallery):
 
     Args:
         path: The result file.
-        read_at: Stamp of the file.
         snapshot: State of the dataset.
 
     Raises:
@@ -109,8 +107,8 @@ class Predictions(Gallery):
         "row": "row of the dataset",
     }
 
-    def __init__(self, path: Path, read_at: Stamp, snapshot: Snapshot) -> None:
-        self._path, self._stamp, self.snapshot = path, read_at, snapshot
+    def __init__(self, path: Path, snapshot: Snapshot) -> None:
+        self._path, self.snapshot = path, snapshot
         with opened(path, "a result file of drakegrasp verify") as file:
             group = file.get(GROUP)
             if not isinstance(group, h5py.Group) or not all(name in group for name in NEEDED):
@@ -145,15 +143,6 @@ class Predictions(Gallery):
             row=self.rows.row,
         )
 
-    def label(self, i: int) -> str:
-        """Return the name of a prediction in addresses, which is its number in the file."""
-        return str(i)
-
-    def find(self, label: str) -> int | None:
-        """Return the number of the prediction with a label, or None if there is none."""
-        there = label.isascii() and label.isdecimal() and len(label) < 10
-        return int(label) if there and int(label) < self.table.count else None
-
     def read(self, numbers: Sequence[int], names: Iterable[str] = FIELDS) -> list[dict[str, Any]]:
         """Return fields of some predictions; None for a field that the file lacks.
 
@@ -162,14 +151,10 @@ class Predictions(Gallery):
             names: Names of the fields.
 
         Raises:
-            DataError: If the file was replaced in the meantime, or is damaged.
+            DataError: If the file is damaged.
         """
         rows, back = np.unique(np.asarray(numbers, dtype=np.int64), return_inverse=True)
         with opened(self._path, "a result file of drakegrasp verify", again=True) as file:
-            if stamp(self._path) != self._stamp:
-                raise DataError(
-                    f"{self._path}: must stay while it is read, got another; load again"
-                )
             columns = {name: _column(file[GROUP], FIELDS[name], rows) for name in names}
         return [{n: None if v is None else v[k] for n, v in columns.items()} for k in back]
 
@@ -203,7 +188,7 @@ class Predictions(Gallery):
             marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
             cards.append(
                 {
-                    "strip": f"/strip/{snapshot.label(at)}-{camera}.png",
+                    "strip": f"/strip/{at}-{camera}.png",
                     "marks": marks,
                     "window": _window(marks, size),
                     "size": size,
@@ -217,18 +202,14 @@ class Predictions(Gallery):
         return cards
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return the content of a prediction's page.
-
-        Raises:
-            DataError: If a file was replaced in the meantime.
-        """
+        """Return the content of a prediction's page."""
         # The verdict, the row, and where both cameras see the contacts, first the file's camera.
         snapshot, at, size = self.snapshot, int(self._places[i]), self.snapshot.config.camera.size
         (verdict,), (row,) = self.read([i]), read_rows(snapshot, [at])
         views = []
         for camera in sorted(CAMERAS, key=lambda name: name != self.rows.camera):
             look = read_look(snapshot, at, camera)
-            strip = f"/strip/{snapshot.label(at)}-{camera}.png"
+            strip = f"/strip/{at}-{camera}.png"
             marks = self._marks(verdict, row, camera, look)
             window = _window(marks, size, wide=camera != self.rows.camera)
             views.append({"camera": camera, "strip": strip, "marks": marks, "window": window})
@@ -239,7 +220,7 @@ class Predictions(Gallery):
             "hints": verdict.get("hints") or "",
             "trial": f"trial {at}",
             "row_words": [_outcome(row["outcome"]), *words_of(snapshot, at)],
-            "row_page": f"/grasp/{snapshot.label(at)}",
+            "row_page": f"/grasp/{at}",
             "views": views,
             "numbers": self._numbers(i, verdict, row),
             "fingers": _fingers(verdict, row),
