@@ -59,13 +59,10 @@ def figures(
     out: Path,
     quiet: bool,
     folder: Path | None = None,
-    trial: int | None = None,
 ) -> None:
     """Draw a dataset: pictures as PNG and SVG, numbers as JSON.
 
     \b
-    phases         one grasp from the side: start, closed, lifted
-    classes        colour, depth and mask of one grasp of each class
     sheet          colour, depth and mask of samples of all objects in turn
     outcomes       how the attempts ended: samples, removed, failed
     hold           samples: how well they hold, how many are distinct
@@ -76,7 +73,6 @@ def figures(
 
     Options:
         --out DIR (folder): Folder of the figures. [default: OUT/figures]
-        --trial ID: Row of trials.hdf5 with the grasp whose phases are drawn.
         --quiet
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
@@ -86,7 +82,7 @@ def figures(
         folder = out / "figures"
         refuse_link(folder)
     with progress_bar("draw", "figures", show=not quiet) as progress:
-        written = write_figures(out, folder, trial_id=trial, progress=progress)
+        written = write_figures(out, folder, progress=progress)
     for name, why in written.left_out.items():
         say(f"{name} is left out: {why}")
     say(f"{counted(len(written.names), 'figure')} in {written.folder}")
