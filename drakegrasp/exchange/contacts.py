@@ -64,15 +64,16 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
             arrays[GRASPS] = np.array(arrays[GRASPS], dtype=float)
         else:
             with open_hdf5(path) as file:
-                group = _choose_group(file, split)
+                group = _choose_group(path, file, split)
                 where = f"{path}: {group.name.rstrip('/')}"
                 arrays = {n: group[n][()] for n in NAMES if isinstance(group.get(n), h5py.Dataset)}
     except (GraspError, MachineError):
         raise
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
+        named = "" if suffix == ".csv" else f" by the name {GRASPS!r}"
         raise GraspError(
-            f"{path}: must be a file of grasps, rows of equally many numbers"
-            f"{'' if suffix == '.csv' else f' by the name {GRASPS!r}'}, got {first_line(error)}"
+            f"{path}: must be a file of grasps, rows of equally many numbers{named}, "
+            f"got none ({first_line(error)})"
         ) from None
 
     # One row per grasp.
@@ -103,7 +104,7 @@ def _read_csv(path: Path) -> Array:
     return np.loadtxt(lines[header:], delimiter=",", comments=None, ndmin=2)
 
 
-def _choose_group(file: h5py.File, split: str | None) -> h5py.Group:
+def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
     """Return the group of an HDF5 file from which to read the grasps; see `read_contacts`."""
     # Find all groups with grasps; the root has an empty name here.
     groups = {"": file} | {k: v for k, v in file.items() if isinstance(v, h5py.Group)}
@@ -119,7 +120,7 @@ def _choose_group(file: h5py.File, split: str | None) -> h5py.Group:
     got = ", ".join(f"/{name}" for name in groups)
     choose = "; choose with --split" if groups else ""
     raise GraspError(
-        f"{file.filename}: must hold an array {GRASPS!r} {must}, "
+        f"{path}: must hold an array {GRASPS!r} {must}, "
         f"got {f'them in {got}' if got else 'none'}{choose}"
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -17,7 +16,6 @@ from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.filters import Removal
-from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
@@ -30,7 +28,6 @@ from drakegrasp.page.looks import (
     read_rows,
 )
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.table import AnyArray
 
 #: Features of an attempt for filtering and sorting, with their display.
 QUANTITIES = {
@@ -80,10 +77,6 @@ class Attempts(Gallery):
     def __init__(self, snapshot: Snapshot, decisions: Decisions, token: str = "") -> None:
         self.snapshot, self.decisions, self.token = snapshot, decisions, token
         self.table = snapshot.table
-
-    def column(self, name: str) -> AnyArray:
-        """Return a column (n,), which may be a feature or the order of the rows."""
-        return self.snapshot.feature(name) if name in QUANTITIES else super().column(name)
 
     def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
         """Return which attempts (n,) match a value of the filter `name`."""
@@ -212,7 +205,6 @@ class Attempts(Gallery):
             "score": _text(snapshot, "suspicion", i),
             "parts": _parts(row),
             "facts": _facts(snapshot, i, row),
-            "pose": _pose_lines(key.object, row),
             "fingers": _fingers(row),
             "scene": attempt_scene(snapshot, i, row, hand),
         }
@@ -220,7 +212,7 @@ class Attempts(Gallery):
 
 def _text(snapshot: Snapshot, name: str, i: int) -> str:
     """Return a feature of an attempt as text."""
-    return QUANTITIES[name].text(snapshot.value(name, i))
+    return QUANTITIES[name].text(snapshot.table[name][i])
 
 
 def words_of(snapshot: Snapshot, i: int) -> list[str]:
@@ -240,7 +232,7 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
 
 def _reasons(snapshot: Snapshot, i: int) -> list[str]:
     """Return the largest parts of an attempt's suspicion, as text."""
-    shares = [(snapshot.value(part.name, i) / part.scale, part.name) for part in PARTS]
+    shares = [(snapshot.table[part.name][i] / part.scale, part.name) for part in PARTS]
     large = sorted((s for s in shares if s[0] >= REASON_SHARE), reverse=True)[:REASONS]
     # A contact without a normal has no normal angle, so this part is infinite.
     return [
@@ -288,17 +280,6 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
         ),
         ("other links after closing", str(int(row["closed_other_links"])) if closed else "–"),
     ]
-
-
-def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:
-    """Return the available poses and joint positions of an attempt as lines of one JSON object."""
-    values: dict[str, Any] = {"object": name}
-    for key in ("X_TO", "X_OG", "closed_q", "X_OG_lifted", "lifted_q"):
-        value = unpack_pose(row[key]) if key.startswith("X_") else row[key]
-        if np.isfinite(value).all():
-            values[key] = value.tolist()
-    lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in values.items()]
-    return ["{", *(f"{line}," for line in lines[:-1]), lines[-1], "}"]
 
 
 def _fingers(row: dict[str, Any]) -> list[list[str]]:

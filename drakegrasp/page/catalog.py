@@ -1,7 +1,7 @@
 """The attempts of a dataset's directory, read once when its pages are first asked for.
 
-A `Snapshot` has in memory what filtering and sorting need: about twenty bytes per attempt, and
-fifty more if the hand closed. Images and poses stay in the files, which must not change meanwhile.
+A `Snapshot` has in memory what filtering and sorting need, about seventy bytes per attempt. Images
+and poses stay in the files, which must not change meanwhile.
 """
 
 from __future__ import annotations
@@ -11,10 +11,8 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config, parse_stored
@@ -47,55 +45,44 @@ _KEPT: dict[str, type[np.generic]] = {
     "precision": np.bool_,
     "stable": np.bool_,
 }
-#: Columns of n attempts in memory, in the order of the dataset's rows. First a table of n rows with
-#: the columns _KEPT and `held`; `removal` is NONE for an attempt that is not a success, `split`
-#: is NONE for one that is not a sample. Then a table with a row for each attempt whose hand closed:
-#: `place` (m,) int32, rising indices into the first table, and FEATURES as float32, NaN if an
-#: attempt ended before, and infinite if a contact has no normal.
-Kept: TypeAlias = tuple[Table, Table]
 
 
-def read_attempts(trials: Trials) -> Kept:
-    """Return the columns of attempts for memory, read block by block.
+def read_attempts(trials: Trials) -> Table:
+    """Return the columns of attempts for memory (n,), in the order of the dataset's rows.
+
+    They are those of _KEPT, `held`, and FEATURES as float32, NaN if an attempt ended before, and
+    infinite if a contact has no normal. `removal` is NONE for an attempt that is not a success,
+    `split` is NONE for one that is not a sample.
 
     Raises:
         DataError: If a file cannot be read.
     """
     names = dict.fromkeys((*_KEPT, *COLUMNS, _READ))
-    blocks = [_columns_of(block) for block in trials.blocks(list(names))]
-    tables, few = zip(*blocks, strict=True)
-    starts = np.cumsum([0, *(table.count for table in tables)]).tolist()
-    moved = [
-        closed.with_columns(place=closed.place + start)
-        for closed, start in zip(few, starts, strict=False)
-    ]
-    return join(tables), join(moved)
+    return join([_columns_of(block) for block in trials.blocks(list(names))])
 
 
-def _columns_of(columns: Mapping[str, AnyArray]) -> Kept:
+def _columns_of(columns: Mapping[str, AnyArray]) -> Table:
     """Return the columns of a block of attempts for memory."""
     # Most attempts never close the hand; only those that do have features.
-    (closed,) = np.nonzero(np.isfinite(columns["time_close"]))
+    closed = np.isfinite(columns["time_close"])
     few = {name: values[closed] for name, values in columns.items()}
     doubts = suspicion(few)
 
     # The largest force of a fingertip, after the lift if there was one.
     lifted = np.isfinite(few["time_lift"])[:, None, None]
     forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
-    extra = {
-        "suspicion": doubts.score,
-        "force": norm(forces).max(axis=1, initial=-np.inf),
-    }
+    found = {"suspicion": doubts.score, "force": norm(forces).max(axis=1, initial=-np.inf)}
 
     # A value that a contact without a normal lacks counts as the largest part, so it is infinite.
-    values = {
+    found |= {
         name: np.where(np.isnan(v) & np.isfinite(doubts.shares[name]), np.inf, v)
         for name, v in doubts.values.items()
     }
-    features = {name: v.astype(np.float32) for name, v in (extra | values).items()}
+    features = {name: np.full(len(closed), np.nan, np.float32) for name in found}
+    for name, values in found.items():
+        features[name][closed] = values
     kept = {name: columns[name].astype(dtype) for name, dtype in _KEPT.items()}
-    table = Table(kept, held=kept["outcome"] == Outcome.SUCCESS)
-    return table, Table(features, place=closed.astype(np.int32))
+    return Table(kept | features, held=kept["outcome"] == Outcome.SUCCESS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,7 +94,7 @@ class Snapshot:
         config: Configuration of the dataset.
         names, classes: Names and classes of the objects, by number.
         trials: The attempts in trials.hdf5.
-        table, closed: Columns of the attempts in memory, see `Kept`.
+        table: Columns of the attempts in memory, see `read_attempts`.
         missing: What is missing, in sentences.
     """
 
@@ -117,20 +104,7 @@ class Snapshot:
     classes: tuple[str, ...]
     trials: Trials
     table: Table
-    closed: Table
     missing: tuple[str, ...]
-
-    def feature(self, name: str) -> npt.NDArray[np.float32]:
-        """Return a feature of all attempts (n,); NaN for an attempt without a value."""
-        values = np.full(self.table.count, np.nan, dtype=np.float32)
-        values[self.closed.place] = self.closed[name]
-        return values
-
-    def value(self, name: str, i: int) -> float:
-        """Return a feature of one attempt; NaN if it has no value."""
-        k = int(np.searchsorted(self.closed.place, i))
-        there = k < self.closed.count and self.closed.place[k] == i
-        return float(self.closed[name][k]) if there else float("nan")
 
     def key(self, i: int) -> AttemptKey:
         """Return the identity of an attempt by its row."""
@@ -190,14 +164,12 @@ def read_snapshot(out: Path) -> Snapshot:
     gone = [name for name in names if find_model(out, name) is None]
     if gone:
         missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
-    table, closed = read_attempts(trials)
     return Snapshot(
         out=out,
         config=config.with_hand(config.hand, carried),
         names=names,
         classes=classes,
         trials=trials,
-        table=table,
-        closed=closed,
+        table=read_attempts(trials),
         missing=tuple(missing),
     )

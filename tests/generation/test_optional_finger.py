@@ -60,4 +60,4 @@ def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(
     # What is not there makes it no more suspicious.
     snapshot = read_snapshot(report.out)
     for part in ("normal_angle", "surface_distance", "normal_sum"):
-        assert np.isfinite(snapshot.value(part, row))
+        assert np.isfinite(snapshot.table[part][row])

@@ -1,12 +1,10 @@
 """The pages in a real browser: Chromium of the system, driven by Playwright.
 
-They skip where there is no Chromium; `make test-browser` installs it on Debian. Screenshots are
-written to the folder that DRAKEGRASP_SCREENSHOTS names, if it is set.
+They skip where there is no Chromium; `make test-browser` installs it on Debian.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import threading
 import time
@@ -120,13 +118,6 @@ def colours_of(page: Page) -> int:
     return len(np.unique(pixels, axis=0))
 
 
-def keep_screenshot(page: Page, name: str) -> None:
-    folder = os.environ.get("DRAKEGRASP_SCREENSHOTS")
-    if folder:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        page.screenshot(path=str(Path(folder) / f"{name}.png"), full_page="narrow" in name)
-
-
 def labels(page: Page, state: Snapshot) -> list[str]:
     found = page.locator("#cards li").evaluate_all("cards => cards.map(c => c.dataset.label)")
     return [numbered(state, label) for label in found]
@@ -204,7 +195,6 @@ def test_pages_fit_and_their_pictures_load(
             wait_for_view(page)
         page.wait_for_load_state("networkidle")
         assert page.evaluate("document.documentElement.scrollWidth") <= width, name
-        keep_screenshot(page, f"{name}_{size}")
 
 
 def test_3d_view_draws_each_state(page: Page, address: str, state: Snapshot) -> None:
@@ -298,10 +288,8 @@ def test_the_gallery_counts_undoes_and_says_what_to_do_next(
     page.wait_for_selector("#nextstep:not([hidden])")
     assert "1 rejected, 1 of them samples now" in page.inner_text("#nextstep")
     assert "drakegrasp assemble" in page.inner_text("#nextstep")
-    keep_screenshot(page, "next_wide")
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    keep_screenshot(page, "next_narrow")
     page.click("[data-undo]")
     page.wait_for_selector("#nextstep", state="hidden")
     assert page.inner_text("#message") == "Undone: 2_box_b, palm pose 1, stand-off 0"
@@ -442,18 +430,16 @@ def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> N
 def test_scenes_filter_and_open(page: Page, out: Path) -> None:
     make_scenes(out, overrides=["scenes.views=3"])
     for address in serve(out):
-        for name, (width, height) in SIZES.items():
+        for width, height in SIZES.values():
             page.set_viewport_size({"width": width, "height": height})
             page.goto(address)
             page.click("text=Scenes")
             page.wait_for_load_state("networkidle")
             assert page.evaluate("document.documentElement.scrollWidth") <= width
-            keep_screenshot(page, f"scenes_{name}")
             page.click("#cards li:nth-child(2) a")
             wait_for_view(page)
             assert page.evaluate("document.documentElement.scrollWidth") <= width
             assert "2 of 3" in page.inner_text(".position")
-            keep_screenshot(page, f"scene_{name}")
         assert page.get_attribute("#view3d", "data-ready") == "yes"
         # Palms, hands and the hand of another grasp are all drawn.
         shots = {page.locator("#view3d").screenshot()}

@@ -30,14 +30,11 @@ def test_table_is_what_the_files_say(boxes: Path) -> None:
             ids = np.flatnonzero(table.split == number)
             np.testing.assert_array_equal(ids, data[split]["trial_id"][:])
     assert (table.removal != NONE).sum() == (table.split != NONE).sum() == 9
-    assert set(snapshot.closed) == {*FEATURES, "place"}
-    np.testing.assert_allclose(snapshot.feature("slip")[table.precision], SLIP)
-    assert snapshot.value("force", 0) == 12.5
+    assert set(FEATURES) < set(table)
+    np.testing.assert_allclose(table.slip[table.precision], SLIP)
     # The second attempt misses a finger, the third is below the table.
-    assert np.isnan(snapshot.feature("slip")[[1, 2]]).all()
-    assert np.isnan(snapshot.value("force", 2))
-    assert snapshot.value("force", 1) == 10.0
-    assert np.isfinite(snapshot.feature("force")[snapshot.closed.place]).all()
+    assert np.isnan(table.slip[[1, 2]]).all()
+    assert table.force[:2].tolist() == [12.5, 10.0] and np.isnan(table.force[2])
 
 
 def test_rows_and_images_are_those_of_the_attempt(boxes: Path) -> None:
@@ -73,7 +70,7 @@ def test_data_files_alone_are_enough_for_images(out: Path) -> None:
 def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
     change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
     snapshot = read_snapshot(out)
-    assert snapshot.value("normal_angle", 0) == np.inf
+    assert snapshot.table.normal_angle[0] == np.inf
     table = Attempts(snapshot, Decisions())
     assert table.select(Attempts.query({"min_normal_angle": "10"})).tolist() == [0]
     assert table.select(Attempts.query({"sort": "normal_angle"}))[0] == 0

@@ -87,10 +87,9 @@ def test_ranges_are_in_the_units_that_are_shown(snapshot: Snapshot) -> None:
 
 
 def test_order_is_by_the_quantity_and_those_without_come_last(snapshot: Snapshot) -> None:
-    closed = snapshot.closed
-    score = closed.suspicion.copy()
-    score[np.searchsorted(closed.place, [0, 3, 11])] = [5.0, np.nan, 7.0]
-    changed = replace(snapshot, closed=closed.with_columns(suspicion=score))
+    score = snapshot.table.suspicion.copy()
+    score[[0, 3, 11]] = [5.0, np.nan, 7.0]
+    changed = replace(snapshot, table=snapshot.table.with_columns(suspicion=score))
     down, up = chosen(changed, ""), chosen(changed, "order=up")
     assert down[:2] == ["0-3-2", "0-0-0"]
     assert up[-3:] == ["0-0-0", "0-3-2", "0-1-0"]

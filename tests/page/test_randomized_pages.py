@@ -43,7 +43,7 @@ def imbalance(out: Path) -> np.ndarray:
 def test_suspicion_is_of_the_drawn_mass(drawn: Path) -> None:
     snapshot, expected = read_snapshot(drawn), imbalance(drawn)
     for i in (0, 3, 11):
-        assert snapshot.value("imbalance", i) == pytest.approx(expected[i], rel=1e-6)
+        assert snapshot.table.imbalance[i] == pytest.approx(expected[i], rel=1e-6)
 
 
 def test_the_filters_of_suspicion_are_of_the_drawn_mass(drawn: Path, tmp_path: Path) -> None:
