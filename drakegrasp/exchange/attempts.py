@@ -482,9 +482,10 @@ def _poses_alone(path: Path) -> Array | None:
 def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
     """Return the rows of our own layout."""
     if unknown := [name for name in arrays if name not in _KNOWN]:
+        others = ", ".join(f"{name!r} of shape {np.shape(arrays[name])}" for name in unknown)
         raise GraspError(
-            f"arrays must be some of {', '.join(_KNOWN)}, got {', '.join(map(repr, unknown))}"
-            f"{_leading_on(arrays, unknown)}"
+            f"arrays must be some of {', '.join(_KNOWN)}, got {others}; contact points and normals "
+            "go into a .npy file, or as `grasps` into an HDF5 file"
         )
     if "X_FG" not in arrays and not {"position", "quaternion"} <= set(arrays):
         there = listed(sorted(arrays))
@@ -522,20 +523,6 @@ def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
         "confidence": arrays.get("confidence"),
         "preshape": texts.get("preshape"),
     }
-
-
-def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
-    """Return advice for arrays that are not postures; empty if there is none."""
-    for name in unknown:
-        shape = np.shape(arrays[name])
-        if name == "grasps" or (len(shape) == 2 and shape[1] % 6 == 0):
-            return (
-                f": contact points and normals go into a .npy file, or as `grasps` into an HDF5 "
-                f"file; {name} is of shape {shape}"
-            )
-        if shape[-2:] in ((4, 4), (3, 4)):
-            return f": poses of the palm go by the name X_FG, with object, not {name}"
-    return ""
 
 
 def _conditions(columns: Mapping[str, Any], count: int) -> dict[str, Any]:
