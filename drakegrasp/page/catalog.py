@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -112,15 +113,16 @@ class Snapshot:
         return AttemptKey(self.names[number], *rest)
 
     def find(self, key: AttemptKey) -> int | None:
-        """Return the row of an attempt by its identity, or None if it does not exist."""
-        table = self.table
+        """Return the row of a success by its identity, or None if it does not exist."""
         number = self.names.index(key.object) if key.object in self.names else -1
-        (found,) = np.nonzero(
-            (table.object == number)
-            & (table.candidate == key.candidate)
-            & (table.standoff_index == key.standoff_index)
-        )
-        return int(found[0]) if len(found) else None
+        return self._successes.get((number, key.candidate, key.standoff_index))
+
+    @cached_property
+    def _successes(self) -> dict[tuple[int, ...], int]:
+        """The rows of the successes by their identities."""
+        rows = np.flatnonzero(self.table.held).tolist()
+        identities = zip(*(self.table[name][rows].tolist() for name in IDENTITY), strict=True)
+        return dict(zip(identities, rows, strict=True))
 
 
 def find_model(out: Path, name: str) -> Path | None:

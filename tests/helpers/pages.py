@@ -13,9 +13,8 @@ import numpy as np
 import trimesh
 from starlette.testclient import TestClient
 
-from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.page.catalog import Snapshot
+from drakegrasp.page.catalog import IDENTITY, Snapshot
 
 #: A name that must stay text.
 ATTACK = "<script>alert(1)</script>"
@@ -34,10 +33,9 @@ def coded(snapshot: Snapshot, text: str) -> str:
     """
 
     def row(found: re.Match[str]) -> str:
-        number, candidate, standoff = map(int, found[0].split("-"))
-        if number >= len(snapshot.names):
-            return "999999"
-        return str(snapshot.find(AttemptKey(snapshot.names[number], candidate, standoff)))
+        identities = np.column_stack([snapshot.table[name] for name in IDENTITY])
+        (rows,) = np.nonzero((identities == [int(n) for n in found[0].split("-")]).all(axis=1))
+        return str(rows[0]) if len(rows) else "999999"
 
     return re.sub(r"\b\d+-\d+-\d+\b", row, text)
 
