@@ -44,8 +44,9 @@ if TYPE_CHECKING:
     from drakegrasp.scoring.proposals import propose
     from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
+    from drakegrasp.simulation.attempts import make_posture
     from drakegrasp.simulation.placement import PlacedObject, place_object
-    from drakegrasp.simulation.posture import Posture, make_posture, run_trial
+    from drakegrasp.simulation.posture import Posture, run_trial
     from drakegrasp.verification.result import PoseTrial, Verification
     from drakegrasp.vision.depth_image import cloud_from_depth, fit_table
 
@@ -88,7 +89,7 @@ _HOMES = {
     "load_hand": "hand.description",
     "load_network": "scoring.network",
     "make_benchmark": "api.building",
-    "make_posture": "simulation.posture",
+    "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",
     "propose": "scoring.proposals",

@@ -22,7 +22,6 @@ from helpers.tiers import in_second_tier
 from drakegrasp.cli.main import main
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import Decisions, write_decisions
-from drakegrasp.exchange.export import not_said, read_publication
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 
@@ -81,7 +80,7 @@ PY_NOT_RUN = {
     "dg.fit_table(": "wants a depth image; tests/vision/test_depth_image.py",
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     "read_closed_grasps(out)": "an exporter of the reader; tests/test_plugin.py",
-    "datasets.load_dataset(": "tests/exchange/hub/test_hub.py reads a folder so",
+    "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
     "lerobot.datasets": "wants LeRobot; tests/exchange/test_lerobot.py",
     "dg.SceneDataset(": "wants scenes and torch; tests/dataset/test_scene_reader.py",
     'dg.verify_grasp(grasp, "mug.obj"': "tests/test_api.py",
@@ -196,16 +195,12 @@ def test_yaml_blocks_are_read(tmp_path: Path) -> None:
             )
         elif "fingers" in content:
             kinds.append("hand")
-        elif "creators" in content:
-            kinds.append("publication")
-            (tmp_path / "about.yaml").write_text(block.text, encoding="utf-8")
-            assert not_said(read_publication(tmp_path / "about.yaml")) == []
         else:
             kinds.append("config")
             path = tmp_path / "mine.yaml"
             path.write_text(block.text, encoding="utf-8")
             assert load_config(str(path)).to_dict() != load_config().to_dict()
-    assert sorted(kinds) == ["config", "hand", "objects", "publication"]
+    assert sorted(kinds) == ["config", "hand", "objects"]
 
 
 def meshes(folder: Path) -> Path:

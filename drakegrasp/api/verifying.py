@@ -21,7 +21,7 @@ from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.contacts import HDF5_SUFFIXES
+from drakegrasp.exchange.columns import HDF5_SUFFIXES
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.placement import Placed, place_object

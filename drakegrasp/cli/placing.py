@@ -19,7 +19,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset, PredictedRows
 from drakegrasp.errors import DataError, GraspError, listed
 from drakegrasp.exchange.attempts import has_rows, holds_postures, read_attempts
-from drakegrasp.exchange.contacts import HDF5_SUFFIXES, read_numbers
+from drakegrasp.exchange.columns import HDF5_SUFFIXES, read_numbers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_mesh

@@ -203,7 +203,7 @@ def _read_cloud(path: Path, units: str) -> Array:
         GraspError: If the file has none.
     """
     from drakegrasp.errors import GraspError, MeshError
-    from drakegrasp.exchange.contacts import read_numbers
+    from drakegrasp.exchange.columns import read_numbers
     from drakegrasp.mesh.loading import load_points
     from drakegrasp.objects.sources import UNITS
 
@@ -236,7 +236,7 @@ def _of_depth(
     """
     from drakegrasp.errors import GraspError
     from drakegrasp.exchange.attempts import named
-    from drakegrasp.exchange.contacts import read_numbers
+    from drakegrasp.exchange.columns import read_numbers
     from drakegrasp.frames import read_pose
     from drakegrasp.vision.depth_image import (
         cloud_from_depth,

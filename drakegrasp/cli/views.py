@@ -59,13 +59,10 @@ def figures(
     out: Path,
     quiet: bool,
     folder: Path | None = None,
-    trial: int | None = None,
 ) -> None:
     """Draw a dataset: pictures as PNG and SVG, numbers as JSON.
 
     \b
-    phases         one grasp from the side: start, closed, lifted
-    classes        colour, depth and mask of one grasp of each class
     sheet          colour, depth and mask of samples of all objects in turn
     outcomes       how the attempts ended: samples, removed, failed
     hold           samples: how well they hold, how many are distinct
@@ -76,7 +73,6 @@ def figures(
 
     Options:
         --out DIR (folder): Folder of the figures. [default: OUT/figures]
-        --trial ID: Row of trials.hdf5 with the grasp whose phases are drawn.
         --quiet
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.foreign_files import refuse_link
@@ -86,7 +82,7 @@ def figures(
         folder = out / "figures"
         refuse_link(folder)
     with progress_bar("draw", "figures", show=not quiet) as progress:
-        written = write_figures(out, folder, trial_id=trial, progress=progress)
+        written = write_figures(out, folder, progress=progress)
     for name, why in written.left_out.items():
         say(f"{name} is left out: {why}")
     say(f"{counted(len(written.names), 'figure')} in {written.folder}")
@@ -115,7 +111,6 @@ def export(
     *,
     form: Annotated[str, Named("exporters")],
     licence: str | None = None,
-    about: Path | None = None,
     attempts: Annotated[str | None, click.Choice(["samples", "failed", "all"])] = None,
     fps: Annotated[int | None, click.IntRange(1, 120)] = None,
 ) -> None:
@@ -126,34 +121,21 @@ def export(
     Options:
         --to (form): The format.
         --licence --license ID: Licence that the card of format hf names, e.g. cc-by-4.0.
-        --about YAML: For format hf: name, version, url, creators, published, licence, citation.
         --attempts WHICH: Attempts of format lerobot: samples; failed: the hand closed, but does
             not hold the object; all: samples, failed and held attempts.  [default: samples]
         --fps N: Frames per second of format lerobot.  [default: 10]
         --quiet
     """
-    from drakegrasp.exchange.export import (
-        Publication,
-        export_dataset,
-        not_said,
-        options_of,
-        read_publication,
-    )
+    from drakegrasp.exchange.export import export_dataset, options_of
     from drakegrasp.foreign_files import refuse_link
 
-    # What only some formats take; the option on publishers overrides the file.
+    # What only some formats take.
     known = options_of(form)
-    for option, value, name in (
-        *(("--about", about, "publication"), ("--licence", licence, "publication")),
-        *(("--attempts", attempts, "attempts"), ("--fps", fps, "fps")),
-    ):
-        if value and name not in known:
-            raise click.UsageError(f"{option} must be left out with --to {form}, got {value}")
-    publication = Publication() if about is None else read_publication(about)
-    if licence:
-        publication = publication.model_copy(update={"licence": licence})
-    given = {"publication": publication, "attempts": attempts, "fps": fps}
-    options = {name: given[name] for name in known if given.get(name)}
+    given = {"licence": licence, "attempts": attempts, "fps": fps}
+    options = {name: value for name, value in given.items() if value}
+    for name, value in options.items():
+        if name not in known:
+            raise click.UsageError(f"--{name} must be left out with --to {form}, got {value}")
 
     if directory is None:
         directory = out / f"export_{form}"
@@ -162,5 +144,3 @@ def export(
     with progress_bar("export", f"{counts}s", show=not quiet) as progress:
         count = export_dataset(out, directory, form, progress=progress, **options)
     say(f"{counted(count, counts)} in {directory}")
-    if "publication" in known and (missing := not_said(publication)):
-        say(f"before it is published, --about should say: {', '.join(missing)}")

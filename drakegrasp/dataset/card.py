@@ -333,8 +333,7 @@ def card_text(content: Mapping[str, Any]) -> str:
     """Return a card as Markdown.
 
     Args:
-        content: Content as `card_content` returns it; the content of an export also has the samples
-            by camera, the camera, the columns, and the columns of scenes (`exchange.hub.folder`).
+        content: Content as `card_content` returns it, or a part of it.
     """
     sections = [section(content) for key, section in SECTIONS if key in content]
     text = "\n\n".join(filter(None, sections))
@@ -464,34 +463,6 @@ def _limits(content: Mapping[str, Any]) -> str:
     return f"## Known limits\n\nThe pages are those of drakegrasp's repository.\n\n{lines}"
 
 
-def _cameras(content: Mapping[str, Any]) -> str:
-    """Return the numbers of samples by camera, and the formula from depth pixels to points."""
-    cameras, unit = content["samples_by_camera"], content["depth_unit"]
-    rows = [(split, *(counts[split] for counts in cameras.values())) for split in SPLITS]
-    (fx, _, cx), (_, fy, cy) = content["camera"]["K"][:2]
-    near, far = content["camera"]["near"], content["camera"]["far"]
-    return f"""## Samples by camera
-
-{_table(("split", *(f"camera `{camera}`" for camera in cameras)), rows)}
-
-## Camera
-
-Both cameras have focal lengths {fx:.6f} and {fy:.6f} and their centre at ({cx:g}, {cy:g}) [px].
-A pixel (u, v) of depth z [m], {1.0 / unit:g} units of the image to a metre, is the point
-((u - {cx:g}) z / {fx:.6f}, (v - {cy:g}) z / {fy:.6f}, z) in the camera's frame. The camera sees
-from {near:g} m on; where nothing is before {far:g} m, the depth is {far:g} m."""
-
-
-def _columns(content: Mapping[str, Any]) -> str:
-    tables = {"## Columns": content["columns"]}
-    tables |= {f"## Columns of `{name}`": of for name, of in content["columns_of"].items()}
-    heads = ("column", "shape", "unit", "frame", "what it is")
-    return "\n\n".join(
-        f"{title}\n\n{_table(heads, [(f'`{name}`', *column) for name, column in columns.items()])}"
-        for title, columns in tables.items()
-    )
-
-
 #: The sections of the card in order, each with the key of the content that it needs.
 SECTIONS: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
     ("conventions", _what),
@@ -502,8 +473,6 @@ SECTIONS: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
     ("fingertip_loads", _pressed),
     ("scenes", _scenes),
     ("limits", _limits),
-    ("columns", _cameras),
-    ("columns", _columns),
 )
 
 

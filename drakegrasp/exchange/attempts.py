@@ -2,30 +2,27 @@
 
 Input: a file or a folder of files, their hand, and the object or dataset rows that they are for.
 Output: one table, `Attempts`, or an error in one line that names the file and the mistake. Each
-format is an importer in the registry, found by the suffix of the file. This module reads our own
+format is an importer in the registry, found by the suffix of the file, which returns the arguments
+of `make_attempts`, and what of these is not for the table: `BESIDE`. This module reads our own
 layouts; the layouts of other tools are read by the modules named after them.
 docs/how-to/postures.md lists all layouts.
 """
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import inspect
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
-from typing import Any, TextIO, overload
+from typing import Any, overload
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp import __version__, registry
-from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import (
     DrakegraspError,
@@ -35,8 +32,10 @@ from drakegrasp.errors import (
     listed,
     one_line,
 )
+from drakegrasp.exchange import columns
+from drakegrasp.exchange.columns import ARRAYS, HDF5_SUFFIXES, MOST_BYTES, TABLES, column_names
 from drakegrasp.exchange.contacts import read_contacts
-from drakegrasp.foreign_files import LARGEST_TEXT, read_npz, refuse_irregular
+from drakegrasp.foreign_files import refuse_irregular
 from drakegrasp.frames import Array, as_numbers, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
@@ -59,13 +58,12 @@ from drakegrasp.verification.prediction import ContactRows, read_grasps
 
 #: Values that a file states once for all its rows.
 _OF_FILE = ("frame", "link", "joints", "hand", "gripper", "of_objects")
-#: Suffixes of files of arrays, tables and YAML files.
-ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
-#: Array of the poses in a file of ACRONYM.
-_ACRONYM = "grasps/transforms"
-#: Maximum total size of the arrays of a file [bytes]: two million postures of a hand with 16
-#: joints.
-MOST_BYTES = 1_000_000_000
+#: Suffixes of YAML files.
+YAMLS = (".yaml", ".yml")
+#: What an importer may say besides the arguments of `make_attempts`: the name of the hand; what
+#: another tool calls it; (n,) trials from which samples were exported; whether each grasp is for
+#: its object in any pose.
+BESIDE = ("hand", "gripper", "trial", "of_objects")
 #: Words that the names of many hands have.
 _COMMON_WORDS = {"hand", "palm", "gripper", "base", "link", "left", "right", "model", "robot"}
 #: The arrays of our own layout that are neither poses nor joints.
@@ -151,7 +149,7 @@ def read_attempts(
         return _for_rows(path, hand, of, read_as)
     if not path.is_dir():
         with named(path):
-            return _made(hand, _named(_raw(path, hand, read_as, nameless=of is not None), of))
+            return _made(hand, _named(_raw(path, hand, read_as), of))
     found = list[Attempts | str]()
     for each in files_in(path):
         try:
@@ -162,14 +160,8 @@ def read_attempts(
     return join_attempts(found)
 
 
-def _raw(
-    path: Path, hand: Hand, read_as: Mapping[str, str], *, nameless: bool = False
-) -> dict[str, Any]:
-    """Return the postures of a file, with the caller's values, as arguments of `make_attempts`.
-
-    There are four additional keys: `hand` is the name of the hand, `gripper` what another tool
-    calls it, `trial` (n,) has the trials from which the samples were exported, and `of_objects`
-    states whether each grasp is for its object in any pose.
+def _raw(path: Path, hand: Hand, read_as: Mapping[str, str]) -> dict[str, Any]:
+    """Return what the importer of a file says, with the values of the caller.
 
     Raises:
         GraspError: If the file is not a file of postures.
@@ -181,10 +173,8 @@ def _raw(
     # Importers of other packages are asked first; they return None for a file that is not theirs.
     for name in reversed(registry.names("importers")):
         if Path(name).suffix == path.suffix.lower():
-            read = registry.find("importers", name)
             try:
-                takes = inspect.signature(read).parameters
-                raw = read(path, hand, **({"nameless": nameless} if "nameless" in takes else {}))
+                raw = registry.find("importers", name)(path, hand)
                 if raw is not None:
                     return _as_asked({**raw, "objects": list(raw["objects"])}, read_as)
             except DrakegraspError:
@@ -217,20 +207,20 @@ def suffixes() -> tuple[str, ...]:
     return tuple(dict.fromkeys(Path(name).suffix for name in registry.names("importers")))
 
 
-def read_arrays(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
-    """Return the postures of arrays in our own layout; if `nameless`, objects need no names."""
-    return _of_arrays(_read_arrays(path), nameless)
+def read_arrays(path: Path, hand: Hand) -> dict[str, Any]:
+    """Return the postures of arrays in our own layout."""
+    return _of_arrays(columns.read_arrays(path))
 
 
-def read_palms(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any] | None:
+def read_palms(path: Path, hand: Hand) -> dict[str, Any] | None:
     """Return the palm poses of a .npy file of (n, 4, 4) numbers; None for any other .npy file."""
     poses = _poses_alone(path)
-    return None if poses is None else _of_arrays({"X_FG": poses}, nameless)
+    return None if poses is None else _of_arrays({"X_FG": poses})
 
 
-def read_columns(path: Path, hand: Hand, nameless: bool = False) -> dict[str, Any]:
-    """Return the postures of a table; if `nameless`, objects need no names."""
-    return _of_columns(*_read_columns(path), nameless)
+def read_columns(path: Path, hand: Hand) -> dict[str, Any]:
+    """Return the postures of a table."""
+    return _of_columns(*columns.read_table(path))
 
 
 def write_attempts(path: Path, table: Attempts, hand: Hand, *, network: str | None = None) -> None:
@@ -290,8 +280,8 @@ def write_attempts(path: Path, table: Attempts, hand: Hand, *, network: str | No
 def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
     """Return the rows, each with an object name; `of` is the name for rows that have none."""
     objects = [name or of or "" for name in raw["objects"]]
-    if raw.get("of_row") is not None and not any(objects):
-        raise GraspError("postures must name an object in each row, got rows of a dataset alone")
+    if not any(objects):
+        raise GraspError("postures must name an `object` in each row, got none")
     return {**raw, "objects": objects, "of_row": None}
 
 
@@ -305,8 +295,7 @@ def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
             f"grasps must be of the hand {hand.name} (--hand), got those of the gripper {gripper}: "
             "if both are the same, name the frame of the poses (--link)"
         )
-    beside = ("hand", "gripper", "trial", "of_objects")
-    said = {name: value for name, value in raw.items() if name not in beside}
+    said = {name: value for name, value in raw.items() if name not in BESIDE}
     try:
         return make_attempts(hand, **said)
     except (HandError, TypeError, ValueError) as error:
@@ -326,7 +315,7 @@ def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, 
     without = set[str]()
     for each in files:
         with named(each):
-            told = _raw(each, hand, read_as, nameless=True)
+            told = _raw(each, hand, read_as)
             raw = _of_split(told, data)
             if raw.get("of_objects"):
                 without |= set(told["objects"]) - set(raw["objects"])
@@ -419,22 +408,21 @@ def holds_postures(path: Path) -> bool:
     try:
         if suffix == ".npy" and path.is_file():
             return is_grasp_file(path) or _poses_alone(path) is not None
-        if suffix in ARRAYS[1:] and path.is_file():
-            with open_hdf5(path) as file:
-                named = {"q_grasp", "X_FG", "quaternion"}
-                return not named.isdisjoint(file) or is_graspgen(file) or _ACRONYM in file
-        if suffix in TABLES and path.is_file():
-            return bool({"object", "qw"} & set(_column_names(path)))
+        if suffix in (*HDF5_SUFFIXES, *TABLES) and path.is_file():
+            there = set(column_names(path))
+            return bool(there & {"q_grasp", "X_FG", "quaternion", "object", "qw"}) or is_graspgen(
+                there
+            )
     except MachineError:
         raise
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
         raise GraspError(f"{path}: {one_line(error)}") from None
-    return suffix in suffixes() and suffix not in (".npy", *ARRAYS[1:], *TABLES)
+    return suffix in suffixes() and suffix not in (".npy", *HDF5_SUFFIXES, *TABLES)
 
 
-def is_graspgen(file: h5py.File) -> bool:
-    """Return whether an HDF5 file holds predictions of GraspGen."""
-    return {"misc", "objects"} <= set(file)
+def is_graspgen(names: Iterable[str]) -> bool:
+    """Return whether an HDF5 file with these names at its root holds predictions of GraspGen."""
+    return {"misc", "objects"} <= set(names)
 
 
 def has_rows(path: Path) -> bool:
@@ -443,15 +431,8 @@ def has_rows(path: Path) -> bool:
     Raises:
         GraspError: If the file cannot be read.
     """
-    if path.is_dir():
-        return False
     with named(path):
-        if path.suffix.lower() in ARRAYS[1:]:
-            with open_hdf5(path) as file:
-                return "row" in file
-        if path.suffix.lower() in ARRAYS:
-            return "row" in _read_arrays(path)
-        return path.suffix.lower() in TABLES and "row" in _column_names(path)
+        return path.suffix.lower() in (*ARRAYS, *TABLES) and "row" in column_names(path)
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -484,22 +465,6 @@ def _sha256(path: Path) -> bytes:
 # Arrays
 
 
-def _read_arrays(path: Path) -> dict[str, Any]:
-    try:
-        if path.suffix.lower() == ".npz":
-            return read_npz(path, MOST_BYTES)
-        with open_hdf5(path) as file:
-            if _ACRONYM in file:
-                raise GraspError(
-                    f"a file of ACRONYM: save its {_ACRONYM} as a .npy file, and read this file "
-                    "with --frame mesh and the --link of its gripper"
-                )
-            refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
-            return {name: _dataset(file[name]) for name in file}
-    except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
-        raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
-
-
 def _poses_alone(path: Path) -> Array | None:
     """Return the poses (n, 4, 4) of a .npy file; None if it holds anything else."""
     try:
@@ -514,30 +479,17 @@ def _poses_alone(path: Path) -> Array | None:
         return None
 
 
-def refuse_large(size: int) -> None:
-    """Reject arrays larger than any file of postures; a small file can unpack to terabytes."""
-    if size > MOST_BYTES:
-        raise GraspError(f"arrays must be at most {MOST_BYTES:.0e} bytes, got {size:.1e}")
-
-
-def _dataset(item: h5py.Dataset | h5py.Group) -> Any:
-    if not isinstance(item, h5py.Dataset):
-        raise GraspError(f"{item.name} must be a dataset, got a group")
-    return item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
-
-
-def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
-    """Return the rows of our own layout; if `nameless`, objects need no names."""
+def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the rows of our own layout."""
     if unknown := [name for name in arrays if name not in _KNOWN]:
+        others = ", ".join(f"{name!r} of shape {np.shape(arrays[name])}" for name in unknown)
         raise GraspError(
-            f"arrays must be some of {', '.join(_KNOWN)}, got {', '.join(map(repr, unknown))}"
-            f"{_leading_on(arrays, unknown)}"
+            f"arrays must be some of {', '.join(_KNOWN)}, got {others}; contact points and normals "
+            "go into a .npy file, or as `grasps` into an HDF5 file"
         )
-    missing = [] if nameless or "row" in arrays or "object" in arrays else ["object"]
     if "X_FG" not in arrays and not {"position", "quaternion"} <= set(arrays):
-        missing.append("X_FG (or position and quaternion)")
-    if missing:
-        raise GraspError(f"{', '.join(missing)} must be there, got only {listed(sorted(arrays))}")
+        there = listed(sorted(arrays))
+        raise GraspError(f"X_FG (or position and quaternion) must be there, got only {there}")
     if "X_FG" in arrays and not {"position", "quaternion"}.isdisjoint(arrays):
         raise GraspError("poses must be X_FG, or position and quaternion, got both")
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
@@ -571,20 +523,6 @@ def _of_arrays(arrays: Mapping[str, Any], nameless: bool) -> dict[str, Any]:
         "confidence": arrays.get("confidence"),
         "preshape": texts.get("preshape"),
     }
-
-
-def _leading_on(arrays: Mapping[str, Any], unknown: Sequence[str]) -> str:
-    """Return advice for arrays that are not postures; empty if there is none."""
-    for name in unknown:
-        shape = np.shape(arrays[name])
-        if name == "grasps" or (len(shape) == 2 and shape[1] % 6 == 0):
-            return (
-                f": contact points and normals go into a .npy file, or as `grasps` into an HDF5 "
-                f"file; {name} is of shape {shape}"
-            )
-        if shape[-2:] in ((4, 4), (3, 4)):
-            return f": poses of the palm go by the name X_FG, with object, not {name}"
-    return ""
 
 
 def _conditions(columns: Mapping[str, Any], count: int) -> dict[str, Any]:
@@ -636,71 +574,10 @@ def _stacked(value: Any, name: str) -> Array:
 # Tables
 
 
-def _column_names(path: Path) -> list[str]:
-    """Return the names of a table's columns; for a CSV file, the cells of its first line."""
-    if path.suffix.lower() == ".parquet":
-        return list(_parquet().read_schema(path).names)
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        return next(_cells(file), [])
-
-
-def _cells(file: TextIO) -> Iterator[list[str]]:
-    """Yield the cells of each line of a CSV file, without the blanks around them.
-
-    Cells are separated by semicolons if the first line has semicolons and no comma, else by commas.
-    """
-    first = file.readline()
-    comma = "," if "," in first or ";" not in first else ";"
-    for row in csv.reader(chain([first], file), delimiter=comma, skipinitialspace=True):
-        yield [cell.strip() for cell in row]
-
-
-def _parquet() -> Any:
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
-    return parquet
-
-
-def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
-    """Return the columns of a table, and for each row why it is invalid, or an empty text."""
-    if path.suffix.lower() == ".parquet":
-        parquet = _parquet()
-        try:
-            said = parquet.read_metadata(path)
-            refuse_large(8 * said.num_rows * said.num_columns)
-            table = parquet.read_table(path)
-            return dict(table.to_pydict()), [""] * table.num_rows
-        except Exception as error:
-            raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
-
-    # A CSV file, which has the names in its first line.
-    try:
-        refuse_irregular(path, LARGEST_TEXT)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header, *rows = _cells(file)
-    except (OSError, ValueError, csv.Error) as error:
-        raise GraspError(f"must be a table with a header, got: {one_line(error)}") from None
-    if twice := [name for name in header if header.count(name) > 1]:
-        raise GraspError(f"columns must have different names, got {twice[0]} twice")
-    size = len(header)
-    invalid = [
-        "" if len(row) == size else f"the row must have {size} values, got {len(row)}"
-        for row in rows
-    ]
-    cells = [[*row, *[""] * size][:size] for row in rows]
-    return {name: [row[i] for row in cells] for i, name in enumerate(header)}, invalid
-
-
-def _of_columns(
-    columns: Mapping[str, list[Any]], invalid: list[str], nameless: bool
-) -> dict[str, Any]:
+def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> dict[str, Any]:
     """Return the rows of a table that has one column per number; see `_of_arrays`."""
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
-    needed = place if nameless or "row" in columns else ["object", *place]
-    missing = [name for name in needed if name not in columns]
-    if missing:
+    if missing := [name for name in place if name not in columns]:
         raise GraspError(f"columns must include {', '.join(missing)}, got {listed(list(columns))}")
 
     def numbers(*names: str) -> Array:
@@ -729,7 +606,7 @@ def _of_columns(
         texts = zip(columns[name], invalid, strict=True)
         told = [str(text or "") for text, bad in texts if name not in _OF_FILE or not bad]
         arrays[name] = np.array(told, dtype=object)
-    raw = _of_arrays(arrays, nameless)
+    raw = _of_arrays(arrays)
     reasons = [one or other for one, other in zip(invalid, raw["invalid"], strict=True)]
     # The columns name the parts of quaternions, so their order is certain.
     return {**raw, "alone": alone, "invalid": reasons, "X_FG_xyzw": None}

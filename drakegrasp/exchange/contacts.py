@@ -14,16 +14,16 @@ import numpy as np
 
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, MachineError, first_line
-from drakegrasp.foreign_files import read_text, refuse_irregular
+from drakegrasp.exchange.columns import HDF5_SUFFIXES, TABLES, parquet, read_numbers
+from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.frames import Array, as_numbers
 
 #: Suffixes of files that can hold grasps.
-HDF5_SUFFIXES = (".h5", ".hdf5")
-SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES, ".parquet")
+SUFFIXES = (".npy", *HDF5_SUFFIXES, *TABLES)
 #: Advice for a file that holds poses instead of contacts.
 _POSES = ": poses of the palm go with joints into a file of postures, as X_FG, object and q_grasp"
 #: Names of the arrays in an HDF5 file, and of the columns in a Parquet file.
-GRASPS, ROWS, CONFIDENCE = "grasps", "rows", "confidence"
+GRASPS, ROWS, CONFIDENCE = NAMES = ("grasps", "rows", "confidence")
 
 
 def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dict[str, Any]:
@@ -47,23 +47,39 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
         GraspError: If the file cannot be read as one of these; the message names the file.
         MachineError: If the file is a Parquet file and pyarrow is not installed.
     """
-    suffix = path.suffix.lower()
+    suffix, where = path.suffix.lower(), str(path)
     if suffix not in SUFFIXES:
-        raise GraspError(f"{path}: must be a file {_listed(SUFFIXES)}, got {suffix!r}")
+        *names, last = SUFFIXES
+        raise GraspError(f"{path}: must be a file {', '.join(names)} or {last}, got {suffix!r}")
     if not path.is_file():
         raise GraspError(f"{path}: must be a file of grasps, got none")
-    if suffix in HDF5_SUFFIXES:
-        arrays, where = _read_hdf5(path, split)
-    elif suffix == ".parquet":
-        arrays, where = _read_parquet(path), str(path)
-    else:
-        read = read_numbers if suffix == ".npy" else _read_csv
-        arrays, where = {GRASPS: read(path)}, str(path)
+    try:
+        if suffix == ".npy":
+            arrays = {GRASPS: read_numbers(path)}
+        elif suffix == ".csv":
+            arrays = {GRASPS: _read_csv(path)}
+        elif suffix == ".parquet":
+            table = parquet().read_table(path)
+            arrays = {n: table[n].to_pylist() for n in NAMES if n in table.column_names}
+            arrays[GRASPS] = np.array(arrays[GRASPS], dtype=float)
+        else:
+            with open_hdf5(path) as file:
+                group = _choose_group(path, file, split)
+                where = f"{path}: {group.name.rstrip('/')}"
+                arrays = {n: group[n][()] for n in NAMES if isinstance(group.get(n), h5py.Dataset)}
+    except (GraspError, MachineError):
+        raise
+    except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
+        named = "" if suffix == ".csv" else f" by the name {GRASPS!r}"
+        raise GraspError(
+            f"{path}: must be a file of grasps, rows of equally many numbers{named}, "
+            f"got none ({first_line(error)})"
+        ) from None
 
     # One row per grasp.
     name = f"{where}/{GRASPS}" if suffix in HDF5_SUFFIXES else where
-    numbers = as_numbers(arrays[GRASPS], f"{name}: must hold real numbers")
-    grasps, rows = _grasps(numbers, name, axes), arrays.get(ROWS)
+    grasps = _grasps(as_numbers(arrays[GRASPS], f"{name}: must hold real numbers"), name, axes)
+    rows = arrays.get(ROWS)
     if rows is not None:
         rows = np.asarray(rows)
         if rows.dtype.kind not in "iu" or rows.shape != (len(grasps),):
@@ -75,94 +91,17 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
     return {GRASPS: grasps, ROWS: rows, CONFIDENCE: arrays.get(CONFIDENCE)}
 
 
-def read_numbers(path: Path) -> Array:
-    """Return the real numbers of a `.npy` file, of any shape. Pickled objects are not loaded.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        GraspError: If the file cannot be read, or does not hold real numbers.
-    """
-    try:
-        refuse_irregular(path)
-        with path.open("rb") as file:
-            array = np.lib.format.read_array(file, allow_pickle=False)
-    # A damaged header may state any size, and then NumPy raises a MemoryError.
-    except (OSError, EOFError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
-        raise GraspError(
-            f"{path}: must be a .npy file of numbers, got none ({first_line(error)})"
-        ) from None
-    return as_numbers(array, f"{path}: must hold real numbers")
-
-
 def _read_csv(path: Path) -> Array:
     """Return the numbers of a text file, one row per line, without the header."""
-    # Read the cells of all lines that are not empty.
-    try:
-        lines = read_text(path, "utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise GraspError(
-            f"{path}: must be a text file of numbers, got none ({first_line(error)})"
-        ) from None
-    rows = [(n, line.split(",")) for n, line in enumerate(lines, start=1) if line.strip()]
-
+    refuse_irregular(path, LARGEST_TEXT)
+    lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
     # The first line is a header only if it has several cells and none of them is a number. A
     # mistyped grasp, or a grasp without commas, must not be taken for a header.
-    if rows and len(rows[0][1]) > 1 and not any(_is_number(cell) for cell in rows[0][1]):
-        del rows[0]
-
-    # All other lines hold the same number of numbers.
-    for number, cells in rows:
-        for column, cell in enumerate(cells, start=1):
-            if not _is_number(cell):
-                raise GraspError(
-                    f"{path}, line {number}: must be numbers with commas between them, "
-                    f"got {cell.strip()[:40]!r} as number {column}"
-                )
-        if len(cells) != len(rows[0][1]):
-            raise GraspError(
-                f"{path}, line {number}: must have {len(rows[0][1])} numbers like line "
-                f"{rows[0][0]}, got {len(cells)}"
-            )
-    return np.array([[float(cell) for cell in cells] for _, cells in rows])
-
-
-def _read_hdf5(path: Path, split: str | None) -> tuple[dict[str, Any], str]:
-    """Return those of the known arrays that an HDF5 file has, and their location."""
-    try:
-        with open_hdf5(path) as file:
-            group = _choose_group(path, file, split)
-            names = [
-                n for n in (GRASPS, ROWS, CONFIDENCE) if isinstance(group.get(n), h5py.Dataset)
-            ]
-            return {n: group[n][()] for n in names}, f"{path}: {group.name.rstrip('/')}"
-    except (OSError, KeyError, RuntimeError, MemoryError) as error:
-        raise GraspError(
-            f"{path}: must be an HDF5 file with grasps, got none ({first_line(error)})"
-        ) from None
-
-
-def _read_parquet(path: Path) -> dict[str, Any]:
-    """Return those of the known columns that a Parquet file has."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ModuleNotFoundError:
-        raise MachineError(
-            f"{path}: Parquet needs pyarrow, got none: pip install 'drakegrasp[hub]'"
-        ) from None
-    try:
-        table = pq.read_table(path)
-        names = [name for name in (GRASPS, ROWS, CONFIDENCE) if name in table.column_names]
-        found = {name: table.column(name).to_pylist() for name in names}
-        found[GRASPS] = np.array(found[GRASPS], dtype=float)
-    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
-        raise GraspError(
-            f"{path}: must be a Parquet file with a column {GRASPS!r} of equally long lists of "
-            f"numbers, got none ({first_line(error)})"
-        ) from None
-    return found
+    cells = lines[0].split(",") if lines else []
+    header = len(cells) > 1 and not any(map(_is_number, cells))
+    if not lines[header:]:
+        raise GraspError(f"{path}: must hold at least one grasp, got none")
+    return np.loadtxt(lines[header:], delimiter=",", comments=None, ndmin=2)
 
 
 def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
@@ -170,10 +109,9 @@ def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
     # Find all groups with grasps; the root has an empty name here.
     groups = {"": file} | {k: v for k, v in file.items() if isinstance(v, h5py.Group)}
     groups = {k: v for k, v in groups.items() if isinstance(v.get(GRASPS), h5py.Dataset)}
-    if split in groups:
-        return groups[split]
-    if "" in groups:
-        return groups[""]
+    for name in (split, ""):
+        if name in groups:
+            return groups[name]
     if split is None and len(groups) == 1:
         return next(iter(groups.values()))
 
@@ -182,8 +120,8 @@ def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
     got = ", ".join(f"/{name}" for name in groups)
     choose = "; choose with --split" if groups else ""
     raise GraspError(
-        f"{path}: must hold an array {GRASPS!r} {must}, got {f'them in {got}' if got else 'none'}"
-        + choose
+        f"{path}: must hold an array {GRASPS!r} {must}, "
+        f"got {f'them in {got}' if got else 'none'}{choose}"
     )
 
 
@@ -206,8 +144,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    """Return names in the form "a, b or c"."""
-    return f"{', '.join(names[:-1])} or {names[-1]}"

@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias
 
@@ -39,15 +38,14 @@ from scipy.spatial.transform import Rotation
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import model_path
 from drakegrasp.errors import DataError, GraspError
-from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.export import ClosedGrasp, samples_by_object
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.wavefront import hull_text
-from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.protocols.files import POSTURES, read_grasp_file
 from drakegrasp.runtime.environment import require_mujoco
@@ -87,17 +85,13 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     (folder / "config" / "hand" / f"{name}.yaml").write_text(settings, encoding="utf-8")
 
     # Write object by object.
-    grasps = list(read_closed_grasps(out))
-    progress(0, len(grasps))
-    done, data = 0, folder / "output" / f"{EXPERIMENT}_{name}" / "graspdata"
-    for thing, same in groupby(grasps, key=lambda grasp: grasp.object_name):
-        parts = convex_parts(load_object(model_path(out, thing)))
-        write_object(folder / OBJECTS / thing, parts)
-        for grasp in same:
-            files.write_grasp(data / thing / f"{grasp.trial_id}.npy", grasp)
-            done += 1
-            progress(done, len(grasps))
-    return done
+    count, data = 0, folder / "output" / f"{EXPERIMENT}_{name}" / "graspdata"
+    for model, samples in samples_by_object(out, progress):
+        write_object(folder / OBJECTS / model.name, convex_parts(model))
+        for grasp in samples:
+            files.write_grasp(data / model.name / f"{grasp.trial_id}.npy", grasp)
+        count += len(samples)
+    return count
 
 
 class BenchFiles:

@@ -6,84 +6,29 @@ absent. Each format is a module with one function that writes a directory; the r
 
 from __future__ import annotations
 
-import datetime
 import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic import Field as Key
 
 from drakegrasp import registry
-from drakegrasp.config import describe_mistake
 from drakegrasp.dataset.opening import refuse_other_codes
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, model_path
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import Trials, sample_ids
 from drakegrasp.errors import DataError, DrakegraspError, one_line
-from drakegrasp.foreign_files import read_text, refuse_address
+from drakegrasp.foreign_files import refuse_address
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
+from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, is_no_room
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.attempts import CONDITIONS
-from drakegrasp.yaml_text import parse_yaml
-
-
-class Publication(BaseModel):
-    """What the publishers of a dataset state; the attributes are the keys of a file, all optional.
-
-    Attributes:
-        name: Name of the dataset, e.g. "Mugs and bowls, Allegro Hand".
-        version: Semantic version of the dataset, e.g. 1.0.0.
-        url: Address of the dataset's page.
-        creators: Names of people or groups.
-        published: Day of publication.
-        licence: Identifier of the licence, e.g. cc-by-4.0.
-        citation: Citation of the dataset, as BibTeX.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    name: str | None = Key(default=None, min_length=1)
-    version: str | None = Key(default=None, pattern=r"^\d+\.\d+\.\d+([-+].+)?$")
-    url: str | None = Key(default=None, pattern=r"^https?://\S+$")
-    creators: tuple[str, ...] = ()
-    published: datetime.date | None = None
-    licence: str | None = Key(default=None, min_length=1)
-    citation: str | None = Key(default=None, min_length=1)
-
-
-#: Keys that Croissant 1.1 requires and that only the publishers can state.
-REQUIRED = ("name", "url", "creators", "published", "licence")
-
-
-def read_publication(path: Path) -> Publication:
-    """Return the publication that a YAML file states.
-
-    Raises:
-        DataError: If the file is not readable YAML, or has an unknown key or an invalid value.
-    """
-    try:
-        content = parse_yaml(read_text(path))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise DataError(f"{path}: must be a readable YAML file, got: {one_line(error)}") from error
-    try:
-        return Publication.model_validate({} if content is None else content)
-    except ValidationError as error:
-        keys = ", ".join(Publication.model_fields)
-        line = describe_mistake(error.errors()[0], whole="the file", legal=f"a known key ({keys})")
-        raise DataError(f"{path}: {line}") from error
-
-
-def not_said(publication: Publication) -> list[str]:
-    """Return the keys that a published dataset must have and this publication lacks."""
-    return [key for key in REQUIRED if not getattr(publication, key)]
 
 
 def export_dataset(
@@ -101,8 +46,7 @@ def export_dataset(
         directory: Directory to write, new or empty; it appears when it is complete.
         form: Name of an exporter, see `drakegrasp.registry`.
         progress: Called with the number of samples written and of all samples.
-        options: Options of the format, see `options_of`. For example, `publication` (a
-            `Publication`) of format `hf` is what the publishers state, for the card and metadata.
+        options: Options of the format, see `options_of`, e.g. `licence` of format `hf`.
 
     Raises:
         DataError: If there is no dataset, the dataset has another schema or no samples, the
@@ -181,6 +125,23 @@ class ClosedGrasp:
         """Return the name of the sample's preshape of a hand; empty if it has no preshape."""
         none = self.preshape is None or not hand.preshapes
         return "" if none else hand.preshape_names[self.preshape or 0]
+
+
+def samples_by_object(
+    out: Path, progress: Report
+) -> Iterator[tuple[ObjectModel, list[ClosedGrasp]]]:
+    """Yield each object that has samples with its samples, and tell the progress.
+
+    Raises:
+        DataError: See `read_closed_grasps`.
+    """
+    grasps, done = list(read_closed_grasps(out)), 0
+    progress(0, len(grasps))
+    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
+        own = list(same)
+        yield load_object(model_path(out, name)), own
+        done += len(own)
+        progress(done, len(grasps))
 
 
 def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:

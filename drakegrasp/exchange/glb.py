@@ -8,7 +8,6 @@ object may have the same name as a link.
 
 from __future__ import annotations
 
-from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +15,11 @@ import trimesh
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import model_path
-from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.export import ClosedGrasp, samples_by_object
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.shapes import hull_triangles, link_shapes
-from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.still_scene import Poses, StillScene
 from drakegrasp.runtime.progress import Report
 from drakegrasp.vision.camera import object_colour
@@ -39,18 +37,14 @@ def write_glb(out: Path, folder: Path, progress: Report) -> int:
     """Write one scene per sample and return the number of scenes; see `export.export_dataset`."""
     hand = load_hand(read_manifest(out).config.hand_source)
     posed, links = StillScene(hand), link_meshes(hand)
-    grasps = list(read_closed_grasps(out))
-    progress(0, len(grasps))
-    done = 0
-    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
-        model = load_object(model_path(out, name))
-        (folder / name).mkdir()
-        for grasp in same:
-            scene = posed_scene(model, posed, links, grasp)
-            (folder / name / f"{grasp.trial_id}.glb").write_bytes(scene.export(file_type="glb"))
-            done += 1
-            progress(done, len(grasps))
-    return done
+    count = 0
+    for model, samples in samples_by_object(out, progress):
+        (folder / model.name).mkdir()
+        for grasp in samples:
+            scene = posed_scene(model, posed, links, grasp).export(file_type="glb")
+            (folder / model.name / f"{grasp.trial_id}.glb").write_bytes(scene)
+        count += len(samples)
+    return count
 
 
 def posed_scene(

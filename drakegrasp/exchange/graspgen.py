@@ -18,7 +18,8 @@ import numpy as np
 
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, listed, one_line
-from drakegrasp.exchange.attempts import is_graspgen, refuse_large
+from drakegrasp.exchange.attempts import is_graspgen
+from drakegrasp.exchange.columns import refuse_large
 from drakegrasp.foreign_files import read_json
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import Hand

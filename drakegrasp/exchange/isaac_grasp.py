@@ -8,7 +8,6 @@ conditions under which the sample held, so that the file can be read back as the
 
 from __future__ import annotations
 
-from itertools import groupby
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -17,17 +16,15 @@ import yaml
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import model_path
 from drakegrasp.errors import GraspError, one_line
 from drakegrasp.exchange.dexgraspbench import pose_vector
-from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.export import ClosedGrasp, samples_by_object
 from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.attempts import CONDITIONS, quaternion_poses
 from drakegrasp.simulation.posture import joint_order
@@ -44,15 +41,11 @@ HELP = "a YAML file per object: poses of the palm link, joints by name"
 def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
     """Write the samples of a dataset and return their number; see `export.export_dataset`."""
     hand = load_hand(read_manifest(out).config.hand_source)
-    grasps = list(read_closed_grasps(out))
     (folder / "meshes").mkdir()
-    done = 0
-    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
-        model = load_object(model_path(out, name))
+    count = 0
+    for model, samples in samples_by_object(out, progress):
         text = obj_text(model.visual_vertices, model.visual_faces, normals=False)
-        (folder / "meshes" / f"{name}.obj").write_text(text, encoding="utf-8")
-
-        entries = {f"trial_{grasp.trial_id}": grasp_entry(hand, grasp) for grasp in same}
+        (folder / "meshes" / f"{model.name}.obj").write_text(text, encoding="utf-8")
         tree = {
             "format": "isaac_grasp",
             "format_version": 1.0,
@@ -60,13 +53,12 @@ def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
             "object_frame": "centre of the bounding box, as in meshes/",
             "gripper_frame": hand.palm_link,
             "hand": hand.name,
-            "grasps": entries,
+            "grasps": {f"trial_{each.trial_id}": grasp_entry(hand, each) for each in samples},
         }
         text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=1000)
-        (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
-        done += len(entries)
-        progress(done, len(grasps))
-    return done
+        (folder / f"{model.name}.yaml").write_text(text, encoding="utf-8")
+        count += len(samples)
+    return count
 
 
 def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:

@@ -303,7 +303,7 @@ def _pose(row: Array) -> Array:
 
 
 class _Video:
-    """A video file, and the counts of each value in the images of the last episode."""
+    """A video file, and the counts of each value in its images."""
 
     def __init__(self, path: Path, fps: int, shape: Sequence[int]) -> None:
         height, width, channels = shape
@@ -429,18 +429,12 @@ class _Writer:
                 self._videos[name].add(image)
 
         # The row of the episode.
-        stats = {name: _number_stats(values) for name, values in columns.items()}
         for name, values in columns.items():
             self._numbers.setdefault(name, []).append(values)
-        for name, video in self._videos.items():
-            stats[name] = _pixel_stats(video.counts, length)
-            self._counts[name] = self._counts.get(name, 0) + video.counts
-            video.counts = np.zeros_like(video.counts)
         file = dict(zip(("chunk_index", "file_index"), divmod(self._part, CHUNK), strict=True))
         ends = (self._length / self._fps, (self._length + length) / self._fps)
         span = dict(zip(("from_timestamp", "to_timestamp"), ends, strict=True))
         nested: dict[str, Mapping[str, Any]] = {
-            **{f"stats/{name}": each for name, each in stats.items()},
             **dict.fromkeys(("data", "meta/episodes"), file),
             **{f"videos/{name}": {**file, **span} for name in self._videos},
         }
@@ -511,6 +505,8 @@ class _Writer:
             return
         for file in (self._data, *self._videos.values()):
             file.close()
+        for name, video in self._videos.items():
+            self._counts[name] = self._counts.get(name, 0) + video.counts
         episodes = pa.Table.from_pylist(self._episodes)
         pq.write_table(episodes, self._path("meta/episodes", "parquet"))
         self._data, self._part = None, self._part + 1

@@ -9,7 +9,6 @@ The palm is fixed to the world.
 
 from __future__ import annotations
 
-from itertools import groupby
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -18,15 +17,14 @@ import mujoco
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.dexgraspbench import pose_vector
-from drakegrasp.exchange.export import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.export import ClosedGrasp, samples_by_object
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.mjcf.decomposition import convex_parts
 from drakegrasp.mjcf.links import MEMORY, make_hand_model, pair_friction, set_inertia
-from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report
 from drakegrasp.vision.camera import object_colour
@@ -44,19 +42,15 @@ def write_mjcf(out: Path, folder: Path, progress: Report) -> int:
     """Write one scene per sample and return the number of scenes; see `export.export_dataset`."""
     config = read_manifest(out).config
     hand = load_plain_hand(config.hand_source, "scenes of MuJoCo")
-    posed, grasps = StillScene(hand), list(read_closed_grasps(out))
-    progress(0, len(grasps))
-    done = 0
-    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
-        thing = load_object(model_path(out, name))
+    posed, count = StillScene(hand), 0
+    for thing, samples in samples_by_object(out, progress):
         scene = ObjectScenes(hand, thing, config, folder)
-        (folder / name).mkdir()
-        for grasp in same:
+        (folder / thing.name).mkdir()
+        for grasp in samples:
             text = scene.posed(grasp, posed.joints)
-            (folder / name / f"{grasp.trial_id}.xml").write_text(text, encoding="utf-8")
-            done += 1
-            progress(done, len(grasps))
-    return done
+            (folder / thing.name / f"{grasp.trial_id}.xml").write_text(text, encoding="utf-8")
+        count += len(samples)
+    return count
 
 
 class ObjectScenes:

@@ -47,7 +47,7 @@ STIFF = (2.0 * TIME_STEP, 1.0)
 #: then yields by less than 0.01 degrees under its largest load.
 RIGID = (0.999, 0.9999, 0.001, 0.5, 2.0)
 #: Torsion radius of a fingertip's patch in Drake [m]: the median of 336 patches of the Barrett Hand
-#: on built-in objects (pipelines/measurements/torsion_radius.py).
+#: on built-in objects (pipelines/measurements/torsion_radius.py of commit cbc3bb01).
 TORSION_RADIUS = 0.0029
 
 

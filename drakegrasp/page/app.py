@@ -10,9 +10,7 @@ from __future__ import annotations
 import os
 import secrets
 import threading
-from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -29,13 +27,14 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from drakegrasp.dataset.paths import SCENES_FILE
+from drakegrasp.dataset.paths import ASSEMBLED_FILES, SCENES_FILE
+from drakegrasp.dataset.trials import stamp
 from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.foreign_files import parse_json
-from drakegrasp.page.actions import DecisionFile, Recordings
+from drakegrasp.page.actions import DecisionFile
 from drakegrasp.page.attempts import Attempts
-from drakegrasp.page.catalog import Catalog, Snapshot, Watched
-from drakegrasp.page.gallery import Gallery, Places, Query, render
+from drakegrasp.page.catalog import read_snapshot
+from drakegrasp.page.gallery import Gallery, render
 from drakegrasp.page.looks import HandView, object_surface, read_look
 from drakegrasp.page.predictions import Predictions, result_file
 from drakegrasp.page.scenes import Scenes
@@ -55,55 +54,43 @@ HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cache-control": "no-store",
 }
-#: A recording contains its own scripts; it runs without access to this server or any other.
-RECORDING_POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' data: blob:; style-src "
-    "'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:; "
-    "sandbox allow-scripts"
-)
 #: Maximum size of a POST [B].
 MAX_BODY = 4096
-#: Maximum number of cached selections, and of all attempts in them, at four bytes each.
-KEPT_SELECTIONS, KEPT_PLACES = 16, 10_000_000
 Params: TypeAlias = Mapping[str, str]
 
 
 class Inspection:
-    """The state of a running inspection.
+    """A dataset on the pages: its attempts, its scenes, and predictions for its rows.
 
     Args:
         out: Directory of the dataset.
         results: File of the verdicts on predictions for the dataset's rows, if there is one.
 
     Raises:
-        DataError: If the directory contains no dataset, if its `reject.json` or the verdicts cannot
-            be read, or if the verdicts belong to another dataset.
+        DataError: If the directory contains no dataset, if one of its files, its `reject.json` or
+            the verdicts cannot be read, or if the verdicts belong to another dataset.
     """
 
     def __init__(self, out: Path, results: Path | None = None) -> None:
-        self.catalog = Catalog(out)
-        self._results = None if results is None else Watched(result_file(results), Predictions)
-        if self._results is not None:
-            self._results.current(self.catalog.current())
+        found = None if results is None else result_file(results)
+        watched = [*(out / name for name in (*ASSEMBLED_FILES, SCENES_FILE)), found]
+        self._stamps = {path: stamp(path) for path in watched if path is not None}
+        self.snapshot = read_snapshot(out)
         self.decisions = DecisionFile(out)
-        self.hand = HandView(self.catalog.current().config)
-        self.recordings = Recordings(out)
-        self._scenes = Watched(out / SCENES_FILE, Scenes)
+        self.hand = HandView(self.snapshot.config)
         self.token = secrets.token_urlsafe(24)
+        self._fixed: dict[type[Gallery], Gallery] = {}
+        if found is not None:
+            self._fixed[Predictions] = Predictions(found, self.snapshot)
+        self._scenes = out / SCENES_FILE
         self._lock = threading.Lock()
-        self._selections: OrderedDict[Any, Places] = OrderedDict()
-        self._selected_from: Snapshot | None = None
-
-    def snapshot(self) -> Snapshot:
-        """Return the state of the files."""
-        return self.catalog.current()
 
     def galleries(self) -> list[type[Gallery]]:
-        """Return the galleries that there are; scenes may be created while the pages are open."""
+        """Return the galleries that there are."""
         found: list[type[Gallery]] = [Attempts]
-        if self._results is not None:
+        if Predictions in self._fixed:
             found.append(Predictions)
-        if os.path.lexists(self._scenes.path):
+        if os.path.lexists(self._scenes):
             found.append(Scenes)
         return found
 
@@ -114,39 +101,27 @@ class Inspection:
             HTTPException: If there is no such table.
             DataError: If its file cannot be read, or belongs to another dataset.
         """
-        snapshot = self.snapshot()
-        if kind is Scenes:
-            if kind not in self.galleries():
-                raise HTTPException(404, "there are no scenes; drakegrasp scenes makes them")
-            return self._scenes.current(snapshot)
-        if kind is Predictions:
-            if self._results is None:
-                why = "there are no predictions; give drakegrasp inspect --predictions"
-                raise HTTPException(404, why)
-            return self._results.current(snapshot)
-        return Attempts(snapshot, self.decisions.read(), self.token)
+        if kind not in self.galleries():
+            how = "drakegrasp scenes makes them" if kind is Scenes else "give --predictions"
+            raise HTTPException(404, f"there are no {kind.NOUN}s: {how}")
+        if kind is Attempts:
+            return Attempts(self.snapshot, self.decisions.read(), self.token)
+        with self._lock:
+            if kind not in self._fixed:
+                self._fixed[kind] = Scenes(self._scenes, self.snapshot)
+            return self._fixed[kind]
 
-    def select(self, table: Gallery, query: Query) -> Places:
-        """Return the rows that a query selects; the last selections of attempts are cached."""
-        if not isinstance(table, Attempts):
-            return table.select(query)
-        key = (query.params(page=1), table.decisions if query["decision"] else None)
-        with self._lock:
-            if self._selected_from is not table.snapshot:
-                self._selections.clear()
-                self._selected_from = table.snapshot
-            if key in self._selections:
-                self._selections.move_to_end(key)
-                return self._selections[key]
-        places = table.select(query)
-        with self._lock:
-            if self._selected_from is table.snapshot:
-                self._selections[key] = places
-            while len(self._selections) > KEPT_SELECTIONS or (
-                len(self._selections) > 1 and sum(map(len, self._selections.values())) > KEPT_PLACES
-            ):
-                self._selections.popitem(last=False)
-        return places
+    def refuse_replaced(self) -> None:
+        """Raise an error if a file is no longer the one that was read.
+
+        Raises:
+            DataError: If a file was replaced.
+        """
+        for path, before in self._stamps.items():
+            if stamp(path) != before:
+                raise DataError(
+                    f"{path}: must stay while it is shown, got another; run inspect again"
+                )
 
     def warm_up(self) -> None:
         """Load everything that the first page would have to wait for."""
@@ -162,52 +137,47 @@ class Inspection:
 
 def _gallery(kind: type[Gallery], inspection: Inspection, name: str, params: Params) -> Response:
     table, query = inspection.table(kind), kind.query(params)
-    chosen = inspection.select(table, query)
+    chosen = table.select(query)
     return HTMLResponse(table.gallery_page(query, chosen, inspection.galleries()))
 
 
 def _row(kind: type[Gallery], inspection: Inspection, name: str, params: Params) -> Response:
     table, query = inspection.table(kind), kind.query(params)
     i = _there(table.find(name), kind.NOUN)
-    chosen = inspection.select(table, query)
-    return HTMLResponse(table.row_page(i, query, chosen, inspection.galleries(), inspection.hand))
+    page = table.row_page(i, query, table.select(query), inspection.galleries(), inspection.hand)
+    return HTMLResponse(page)
 
 
 def _view(inspection: Inspection, name: str, params: Params) -> Response:
     scenes = inspection.table(Scenes)
     assert isinstance(scenes, Scenes)
-    label, _, number = name.rpartition("-")
-    views = scenes.views(_there(scenes.find(label), "scene"))
+    scene, _, number = name.partition("-")
+    views = scenes.views(_there(scenes.find(scene), "scene"))
     known = {str(k): int(view) for k, view in enumerate(views)}
     colours, *_ = scenes.data.stored_images(_there(known.get(number), "view"))
     return Response(colour_png(colours), media_type="image/png")
 
 
 def _strip(inspection: Inspection, name: str, params: Params) -> Response:
-    snapshot = inspection.snapshot()
-    label, _, camera = name.rpartition("-")
-    i = snapshot.find(label)
+    snapshot = inspection.snapshot
+    number, _, camera = name.rpartition("-")
+    i = inspection.table(Attempts).find(number)
     look = _there(None if i is None else read_look(snapshot, i, camera), "image")
     png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
     return Response(png, media_type="image/png")
 
 
 def _mesh(inspection: Inspection, name: str, params: Params) -> Response:
-    snapshot, content = inspection.snapshot(), None
+    content = None
     kind, _, which = name.partition("-")
     try:
         if kind == "link":
             content = inspection.hand.surface(int(which))
         elif kind == "object":
-            content = object_surface(snapshot, snapshot.numbers[which])
-    except (IndexError, KeyError, ValueError, FileNotFoundError):
+            content = object_surface(inspection.snapshot, int(which))
+    except (IndexError, ValueError, FileNotFoundError):
         pass
     return Response(_there(content, "mesh"), media_type="application/json")
-
-
-def _recording(inspection: Inspection, name: str, params: Params) -> Response:
-    content = _there(inspection.recordings.read(name), "recording")
-    return HTMLResponse(content, headers={"content-security-policy": RECORDING_POLICY})
 
 
 def _there(found: Any, noun: str) -> Any:
@@ -229,7 +199,6 @@ PAGES: dict[str, Answer] = {
     "/view/{name}.png": _view,
     "/strip/{name}.png": _strip,
     "/mesh/{name}.json": _mesh,
-    "/recording/{name}.html": _recording,
 }
 
 
@@ -237,41 +206,29 @@ PAGES: dict[str, Answer] = {
 
 
 def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
-    snapshot, decision = inspection.snapshot(), content.get("decision")
-    i = snapshot.find(str(content.get("label")))
-    if i is None or not snapshot.table.held[i]:
+    table, decision = inspection.table(Attempts), content.get("decision")
+    i = table.find(str(content.get("label")))
+    if i is None or not table.table.held[i]:
         raise HTTPException(404, "the attempt must be a success of the dataset")
-    try:
-        found = inspection.decisions.decide(snapshot.key(i), str(decision))
-    except ValueError as error:
-        raise HTTPException(400, str(error)) from None
-    counts = Attempts(snapshot, found).counts()
-    return JSONResponse({"label": snapshot.label(i), "decision": decision, "counts": counts})
+    if decision not in ("rejected", ""):
+        raise HTTPException(400, f"decision must be rejected or empty, got {decision!r}")
+    found = inspection.decisions.decide(inspection.snapshot.key(i), decision)
+    counts = Attempts(inspection.snapshot, found).counts()
+    return JSONResponse({"label": i, "decision": decision, "counts": counts})
 
 
 def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
     undone = inspection.decisions.undo()
     if undone is None:
         return JSONResponse({"name": None})
-    snapshot = inspection.snapshot()
-    place = snapshot.find_key(undone.key)
     return JSONResponse(
         {
             "name": printable(str(undone.key)),
-            "label": None if place is None else snapshot.label(place),
+            "label": inspection.snapshot.find(undone.key),
             "decision": undone.before,
-            "counts": Attempts(snapshot, inspection.decisions.read()).counts(),
+            "counts": Attempts(inspection.snapshot, inspection.decisions.read()).counts(),
         }
     )
-
-
-def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
-    snapshot, label = inspection.snapshot(), str(content.get("label"))
-    i = snapshot.find(label)
-    if i is None:
-        raise HTTPException(404, "the attempt must be one of the dataset")
-    found = inspection.recordings.make(label, i)
-    return JSONResponse({"url": f"/recording/{label}.html", "same": found.same, "text": found.text})
 
 
 # The application.
@@ -283,29 +240,25 @@ def make_app(inspection: Inspection) -> Starlette:
     def get(path: str, show: Answer) -> Route:
         async def endpoint(request: Request) -> Response:
             name = request.path_params.get("name", "")
-            return await run_in_threadpool(show, inspection, name, request.query_params)
+            answer = await run_in_threadpool(show, inspection, name, request.query_params)
+            inspection.refuse_replaced()
+            return answer
 
         return Route(path, endpoint)
 
     def post(path: str, change: Callable[[Inspection, dict[str, Any]], Response]) -> Route:
         async def endpoint(request: Request) -> Response:
             content = await _content(request, inspection.token)
+            inspection.refuse_replaced()
             return await run_in_threadpool(change, inspection, content)
 
         return Route(path, endpoint, methods=["POST"])
 
-    @asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        yield
-        inspection.recordings.close()
-
     app = Starlette(
-        lifespan=lifespan,
         routes=[
             *(get(path, show) for path, show in PAGES.items()),
             post("/decide", _decide),
             post("/undo", _undo),
-            post("/record", _record),
             Mount("/static", StaticFiles(directory=ASSETS)),
         ],
         middleware=[

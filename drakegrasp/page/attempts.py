@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -11,26 +10,24 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.assembly.survey import own_setting
+from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.quality import PARTS, suspicion
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.filters import Removal
-from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import IDENTITY, Snapshot
+from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
 from drakegrasp.page.looks import (
     THUMBNAIL,
     HandView,
     attempt_scene,
     contact_dots,
-    look_source,
     read_look,
     read_rows,
 )
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.table import AnyArray
 
 #: Features of an attempt for filtering and sorting, with their display.
 QUANTITIES = {
@@ -51,7 +48,7 @@ class Attempts(Gallery):
 
     Args:
         snapshot: State of the files.
-        decisions: Attempts that were rejected and kept.
+        decisions: Attempts that were rejected.
         token: Token with which a page decides; empty if it cannot.
     """
 
@@ -61,7 +58,7 @@ class Attempts(Gallery):
         "split": ("samples", *SPLITS, "none"),
         "hold": ("held", "precision", "stable"),
         "removal": tuple(removal.label for removal in Removal),
-        "decision": ("rejected", "kept", "open"),
+        "decision": ("rejected", "open"),
     }
     SELECTS: ClassVar = {
         **{name: name for name in ("class", "object", "outcome", "split")},
@@ -81,14 +78,11 @@ class Attempts(Gallery):
         self.snapshot, self.decisions, self.token = snapshot, decisions, token
         self.table = snapshot.table
 
-    def column(self, name: str) -> AnyArray:
-        """Return a column (n,), which may be a feature or the order of the rows."""
-        return self.snapshot.feature(name) if name in QUANTITIES else super().column(name)
-
     def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
         """Return which attempts (n,) match a value of the filter `name`."""
         if name == "decision":
-            return self._decided(value)
+            rejected = self._rejected()
+            return rejected if value == "rejected" else self.table.held & ~rejected
         if name == "split" and value in SPLIT_NAMES:
             return np.asarray((self.table.split == NONE) == (value == "none"))
         return super().matches(name, value)
@@ -102,40 +96,19 @@ class Attempts(Gallery):
             found = {"samples": SPLIT_NAMES["samples"], **found, "none": SPLIT_NAMES["none"]}
         return {value: text for value, text in found.items() if (name, value) != KEPT}
 
-    def label(self, i: int) -> str:
-        """Return the name of an attempt in addresses."""
-        return self.snapshot.label(i)
-
-    def find(self, label: str) -> int | None:
-        """Return the index of the attempt with a label, or None if there is none."""
-        return self.snapshot.find(label)
-
     # Decisions.
 
     def counts(self) -> dict[str, int]:
-        """Return the numbers of rejected attempts, kept attempts, and rejected samples."""
-        rejected, kept, samples = self.decisions.rejected, self.decisions.kept, 0
-        if rejected:
-            samples = int((self._decided("rejected") & (self.snapshot.table.split != NONE)).sum())
-        return {"rejected": len(rejected), "kept": len(kept), "samples": samples}
+        """Return the numbers of rejected attempts, and of those of them that are samples now."""
+        samples = self._rejected() & (self.table.split != NONE)
+        return {"rejected": len(self.decisions.rejected), "samples": int(samples.sum())}
 
-    def _decided(self, decision: str) -> npt.NDArray[np.bool_]:
-        """Return which attempts (n,) are rejected, kept, or open; only successes are decided."""
-        snapshot, decisions = self.snapshot, self.decisions
-        keys = {"rejected": decisions.rejected, "kept": decisions.kept}.get(
-            decision, decisions.rejected | decisions.kept
-        )
-        numbers = {name: i for i, name in enumerate(snapshot.names)}
-        wanted = {
-            (numbers[key.object], key.candidate, key.standoff_index)
-            for key in keys
-            if key.object in numbers
-        }
-        hits = np.flatnonzero(self.table.held)
-        identities = zip(*(self.table[name][hits].tolist() for name in IDENTITY), strict=True)
-        decided = np.array([identity in wanted for identity in identities], dtype=bool)
+    def _rejected(self) -> npt.NDArray[np.bool_]:
+        """Return which attempts (n,) are rejected."""
         found = np.zeros(self.table.count, dtype=bool)
-        found[hits] = decided != (decision == "open")
+        for key in self.decisions.rejected:
+            if (place := self.snapshot.find(key)) is not None:
+                found[place] = True
         return found
 
     def _decisions(self) -> dict[str, Any]:
@@ -178,15 +151,16 @@ class Attempts(Gallery):
         rows = read_rows(snapshot, shown.tolist(), THUMBNAIL)
         for i, row in zip(shown.tolist(), rows, strict=True):
             outcome = Outcome(int(snapshot.table.outcome[i]))
-            success = outcome is Outcome.SUCCESS
+            sample = snapshot.table.split[i] != NONE
             cards.append(
                 {
                     "outcome": outcome.label.replace("_", " "),
-                    "success": success,
+                    "success": outcome is Outcome.SUCCESS,
+                    "sample": sample,
                     "size": snapshot.config.camera.size,
-                    "strip": f"/strip/{snapshot.label(i)}-oto.png",
-                    # Failures have no images.
-                    "dots": contact_dots(snapshot, row, "oto") if success else [],
+                    "strip": f"/strip/{i}-oto.png",
+                    # Other attempts have no images.
+                    "dots": contact_dots(snapshot, row, "oto") if sample else [],
                     "words": words_of(snapshot, i),
                     "suspicion": _text(snapshot, "suspicion", i),
                     "reasons": _reasons(snapshot, i),
@@ -196,26 +170,32 @@ class Attempts(Gallery):
         return cards
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return the content of an attempt's page.
-
-        Raises:
-            DataError: If a file was replaced in the meantime.
-        """
+        """Return the content of an attempt's page."""
         # The row of the attempt, and where both cameras see its contacts.
         snapshot = self.snapshot
         (row,) = read_rows(snapshot, [i])
         outcome = Outcome(int(snapshot.table.outcome[i]))
         views = []
-        for camera in CAMERAS if outcome is Outcome.SUCCESS else ():
+        for camera in CAMERAS if snapshot.table.split[i] != NONE else ():
             look = read_look(snapshot, i, camera)
-            unread = look_source(snapshot, i, camera) if look is None else ""
-            strip = f"/strip/{snapshot.label(i)}-{camera}.png"
+            unread = DATA_FILES[camera] if look is None else ""
+            strip = f"/strip/{i}-{camera}.png"
             dots = contact_dots(snapshot, row, camera, look)
             views.append({"camera": camera, "strip": strip, "unread": unread, "dots": dots})
 
         key = snapshot.key(i)
         return {
-            "replay": shlex.join(["drakegrasp", "replay", str(snapshot.out), "--trial", str(i)]),
+            "replay": shlex.join(
+                [
+                    "drakegrasp",
+                    "replay",
+                    str(snapshot.out),
+                    "--trial",
+                    str(i),
+                    "--html",
+                    "trial.html",
+                ]
+            ),
             **self._decisions(),
             "outcome": outcome.label.replace("_", " "),
             "words": words_of(snapshot, i),
@@ -225,7 +205,6 @@ class Attempts(Gallery):
             "score": _text(snapshot, "suspicion", i),
             "parts": _parts(row),
             "facts": _facts(snapshot, i, row),
-            "pose": _pose_lines(key.object, row),
             "fingers": _fingers(row),
             "scene": attempt_scene(snapshot, i, row, hand),
         }
@@ -233,7 +212,7 @@ class Attempts(Gallery):
 
 def _text(snapshot: Snapshot, name: str, i: int) -> str:
     """Return a feature of an attempt as text."""
-    return QUANTITIES[name].text(snapshot.value(name, i))
+    return QUANTITIES[name].text(snapshot.table[name][i])
 
 
 def words_of(snapshot: Snapshot, i: int) -> list[str]:
@@ -253,7 +232,7 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
 
 def _reasons(snapshot: Snapshot, i: int) -> list[str]:
     """Return the largest parts of an attempt's suspicion, as text."""
-    shares = [(snapshot.value(part.name, i) / part.scale, part.name) for part in PARTS]
+    shares = [(snapshot.table[part.name][i] / part.scale, part.name) for part in PARTS]
     large = sorted((s for s in shares if s[0] >= REASON_SHARE), reverse=True)[:REASONS]
     # A contact without a normal has no normal angle, so this part is infinite.
     return [
@@ -301,17 +280,6 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
         ),
         ("other links after closing", str(int(row["closed_other_links"])) if closed else "–"),
     ]
-
-
-def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:
-    """Return the available poses and joint positions of an attempt as lines of one JSON object."""
-    values: dict[str, Any] = {"object": name}
-    for key in ("X_TO", "X_OG", "closed_q", "X_OG_lifted", "lifted_q"):
-        value = unpack_pose(row[key]) if key.startswith("X_") else row[key]
-        if np.isfinite(value).all():
-            values[key] = value.tolist()
-    lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in values.items()]
-    return ["{", *(f"{line}," for line in lines[:-1]), lines[-1], "}"]
 
 
 def _fingers(row: dict[str, Any]) -> list[list[str]]:

@@ -135,14 +135,6 @@ class Gallery(ABC):
     table: Table
 
     @abstractmethod
-    def label(self, i: int) -> str:
-        """Return the name of a row in addresses."""
-
-    @abstractmethod
-    def find(self, label: str) -> int | None:
-        """Return the row with a label, or None if there is none."""
-
-    @abstractmethod
     def summary(self, query: Query, chosen: Places) -> dict[str, Any]:
         """Return the content of the gallery besides its cards."""
 
@@ -152,11 +144,7 @@ class Gallery(ABC):
 
     @abstractmethod
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return the content of a row's page.
-
-        Raises:
-            DataError: If a file was replaced in the meantime.
-        """
+        """Return the content of a row's page."""
 
     # Methods that a table may override.
 
@@ -184,6 +172,11 @@ class Gallery(ABC):
         return {"title": self.snapshot.names[number], "class_name": self.snapshot.classes[number]}
 
     # What all tables share.
+
+    def find(self, text: str) -> int | None:
+        """Return the row whose number an address has, or None if there is none."""
+        there = text.isascii() and text.isdecimal() and len(text) < 10
+        return int(text) if there and int(text) < self.table.count else None
 
     @classmethod
     def query(cls, params: Mapping[str, str] | None = None) -> Query:
@@ -252,7 +245,7 @@ class Gallery(ABC):
         # The cards, each with the address of its page.
         cards = self.cards(shown)
         for i, card in zip(shown.tolist(), cards, strict=True):
-            card |= self.identity(i) | {"label": self.label(i), "href": self._address(i, query)}
+            card |= self.identity(i) | {"label": i, "href": self._address(i, query)}
         return render(
             f"gallery_{self.ROW}.html",
             galleries,
@@ -286,9 +279,6 @@ class Gallery(ABC):
             chosen: All rows that the query selects, in order.
             galleries: The galleries that there are.
             hand: Hand of the dataset.
-
-        Raises:
-            DataError: If a file was replaced in the meantime.
         """
         values = self.row(i, hand)
         scene, place = values["scene"], np.flatnonzero(chosen == i)
@@ -300,14 +290,14 @@ class Gallery(ABC):
         return render(
             f"{self.ROW}.html",
             galleries,
-            label=self.label(i),
+            label=i,
             noun=self.ROW,
             position="not in the selection" if k is None else f"{k + 1:,} of {len(chosen):,}",
             previous=address(k - 1) if k else "",
             next=address(k + 1) if k is not None and k + 1 < len(chosen) else "",
             gallery=self._home(query),
             meshes={
-                "object": f"/mesh/object-{scene['objectCode']}.json",
+                "object": f"/mesh/object-{scene['objectNumber']}.json",
                 "links": [f"/mesh/link-{number}.json" for number in range(scene["links"])],
             },
             problem=hand.problem,
@@ -318,7 +308,7 @@ class Gallery(ABC):
 
     def _address(self, i: int, query: Query) -> str:
         params = query.params()
-        return f"/{self.ROW}/{self.label(i)}" + f"?{params}" * bool(params)
+        return f"/{self.ROW}/{i}" + f"?{params}" * bool(params)
 
     def _home(self, query: Query, **changes: object) -> str:
         params = query.params(**changes)

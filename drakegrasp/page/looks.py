@@ -20,7 +20,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.paths import DATA_FILES, shards_folder
+from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
@@ -75,11 +75,8 @@ def read_rows(
 
     Args:
         snapshot: State of the files.
-        places: Indices of the attempts in the table.
+        places: Rows of the attempts.
         names: Names of the columns; all if None.
-
-    Raises:
-        DataError: If a file was replaced in the meantime.
     """
     columns = snapshot.trials[places].columns(names or [f.name for f in TRIAL_FIELDS])
     return [
@@ -88,64 +85,23 @@ def read_rows(
 
 
 def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
-    """Return the images of an attempt, or None if there are none.
+    """Return the images of a sample, or None if they cannot be read.
 
-    The images of a sample are in the data file; those of other successes are in their shard.
-
-    Raises:
-        DataError: If a file was replaced in the meantime.
+    Args:
+        snapshot: The dataset.
+        i: Row of the attempt.
+        camera: `oto` or `otm`.
     """
+    split = snapshot.table.split
+    if split[i] == NONE:
+        return None
+    row = np.count_nonzero(split[:i] == split[i])
     try:
-        if snapshot.table.split[i] != NONE:
-            look = _sample_look(snapshot, i, camera)
-        else:
-            look = _shard_look(snapshot, i, camera)
+        with open_hdf5(snapshot.out / DATA_FILES[camera]) as file:
+            own = file[SPLITS[split[i]]]
+            return Look(image=own["images"][row], mask=own["masks"][row])
     except (OSError, KeyError, ValueError, IndexError):
-        look = None
-    snapshot.refuse_replaced()
-    return look
-
-
-def look_source(snapshot: Snapshot, i: int, camera: str) -> str:
-    """Return the name of the file that `read_look` reads, in words."""
-    is_there = (snapshot.out / DATA_FILES[camera]).is_file()
-    if snapshot.table.split[i] != NONE and is_there:
-        return DATA_FILES[camera]
-    return f"shards of {snapshot.key(i).object}"
-
-
-def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
-    number = snapshot.table.split[i]
-    split, row = SPLITS[number], np.count_nonzero(snapshot.table.split[:i] == number)
-    path = snapshot.out / DATA_FILES[camera]
-    if not path.is_file():
-        return _shard_look(snapshot, i, camera)
-    with open_hdf5(path) as file:
-        return Look(image=file[split]["images"][row], mask=file[split]["masks"][row])
-
-
-def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
-    # The name of a shard ends with the end of the object's palm poses.
-    key, number = snapshot.key(i), snapshot.table.object[i]
-    *_, unit = snapshot.config.unit_ranges(key.candidate + 1)
-    # If palm poses are added, they continue in a shard with another end; names sort by their ends.
-    path = max(shards_folder(snapshot.out, key.object).glob(f"{unit.start:07d}-*.h5"))
-    due = snapshot.own_hashes.get(key.object, snapshot.config_hash), snapshot.meshes[number]
-    with open_hdf5(path) as file:
-        # A shard of another configuration or mesh contains other attempts.
-        if (file.attrs["config_hash"], file.attrs["mesh_sha256"]) != due:
-            return None
-
-        # The row of the attempt in its shard, then the row of its images.
-        trials, looks = file["trials"], file["looks"]
-        here = trials["candidate"][:] == key.candidate
-        here &= trials["standoff_index"][:] == key.standoff_index
-        (rows,) = np.nonzero(here)
-        (found,) = np.nonzero(looks["row"][:] == rows[0])
-        if not len(found):
-            return None
-        k = int(found[0])
-        return Look(image=looks[f"image_{camera}"][k], mask=looks[f"mask_{camera}"][k])
+        return None
 
 
 def contact_dots(
@@ -332,7 +288,7 @@ def make_scene(
     """
     return {
         "object": _columns(X_TO),
-        "objectCode": snapshot.codes[number],
+        "objectNumber": number,
         "objectName": snapshot.names[number],
         "hasObject": find_model(snapshot.out, snapshot.names[number]) is not None,
         "links": len(hand.links),

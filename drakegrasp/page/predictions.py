@@ -1,20 +1,18 @@
 """Predictions and their verdicts on the page, with the rows of the dataset that they are for.
 
-Input: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. The
-values that filters and sorting need are in memory; all other values of a verdict are read when a
-page shows them. A field that the file lacks is read as without a value.
+Input: the HDF5 file that `drakegrasp verify --out` writes, and a snapshot of the dataset. A field
+that the file lacks is read as without a value.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.dataset.opening import differences, opened, read_codes, refuse_first
@@ -27,7 +25,6 @@ from drakegrasp.dataset.schema import (
     Shown,
     refuse_other_schema,
 )
-from drakegrasp.dataset.trials import Stamp, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -75,8 +72,6 @@ WORDS = ("held", "success", "precision", "stable", "sample")
 VERDICTS = ("fails", *WORDS, "held_any")
 #: Kinds of contacts, and the columns of a verdict that contain them.
 _CONTACTS = {"requested": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_nhat_Q_O")}
-#: Fields of a verdict that its card needs.
-ON_CARDS = ("reason", *(name for names in _CONTACTS.values() for name in names))
 #: Width of the shown part of an image over that of its marks, and the smallest shown fraction.
 LOOSE, LEAST_SHOWN = 1.7, 0.4
 #: The largest force of a fingertip.
@@ -88,7 +83,6 @@ class Predictions(Gallery):
 
     Args:
         path: The result file.
-        read_at: Stamp of the file.
         snapshot: State of the dataset.
 
     Raises:
@@ -109,8 +103,8 @@ class Predictions(Gallery):
         "row": "row of the dataset",
     }
 
-    def __init__(self, path: Path, read_at: Stamp, snapshot: Snapshot) -> None:
-        self._path, self._stamp, self.snapshot = path, read_at, snapshot
+    def __init__(self, path: Path, snapshot: Snapshot) -> None:
+        self._path, self.snapshot = path, snapshot
         with opened(path, "a result file of drakegrasp verify") as file:
             group = file.get(GROUP)
             if not isinstance(group, h5py.Group) or not all(name in group for name in NEEDED):
@@ -120,23 +114,22 @@ class Predictions(Gallery):
             names = group["object"].asstr()[:].tolist()
             self.rows = _matched(path, file, snapshot, names)
             outcome = read_codes(group["outcome"], list(Outcome))
-            there = [n for n in (*VERDICTS, *QUANTITIES, "p_OQ") if n in group and n != "held"]
-            columns = {name: group[name][:] for name in there}
+            self._columns = {name: _column(group, field) for name, field in FIELDS.items()}
 
         # The largest value of the contacts; different hands may have different numbers of fingers.
-        p_OQ, held = columns.pop("p_OQ"), outcome == Outcome.SUCCESS
+        columns, held = dict(self._columns), outcome == Outcome.SUCCESS
         self._places = self.rows.trial_id
-        true = snapshot.trials[self._places.tolist()]["closed_p_OQ"]
+        true, p_OQ = snapshot.trials[self._places.tolist()]["closed_p_OQ"], columns["p_OQ"]
         columns["true_error"] = norm(p_OQ - true) if p_OQ.shape == true.shape else None
-        largest = {name: _largest(columns.pop(name, None), len(held)) for name in QUANTITIES}
+        largest = {name: _largest(columns[name], len(held)) for name in QUANTITIES}
+        words = {name: columns[name] for name in VERDICTS if columns.get(name) is not None}
 
         # The worst predictions are those that fail, and among these those whose hand reached no
         # contact; then the distance of predicted from reached contacts decides, mapped to below 1.
         error = largest["contact_error"]
         share = np.where(np.isnan(error), 1.0, error / (1.0 + error))
         self.table = Table(
-            columns,
-            **largest,
+            largest | {name: values for name, values in words.items() if name != "held"},
             object=snapshot.table.object[self._places],
             outcome=outcome,
             fails=~held,
@@ -145,33 +138,9 @@ class Predictions(Gallery):
             row=self.rows.row,
         )
 
-    def label(self, i: int) -> str:
-        """Return the name of a prediction in addresses, which is its number in the file."""
-        return str(i)
-
-    def find(self, label: str) -> int | None:
-        """Return the number of the prediction with a label, or None if there is none."""
-        there = label.isascii() and label.isdecimal() and len(label) < 10
-        return int(label) if there and int(label) < self.table.count else None
-
-    def read(self, numbers: Sequence[int], names: Iterable[str] = FIELDS) -> list[dict[str, Any]]:
-        """Return fields of some predictions; None for a field that the file lacks.
-
-        Args:
-            numbers: Numbers of the predictions.
-            names: Names of the fields.
-
-        Raises:
-            DataError: If the file was replaced in the meantime, or is damaged.
-        """
-        rows, back = np.unique(np.asarray(numbers, dtype=np.int64), return_inverse=True)
-        with opened(self._path, "a result file of drakegrasp verify", again=True) as file:
-            if stamp(self._path) != self._stamp:
-                raise DataError(
-                    f"{self._path}: must stay while it is read, got another; load again"
-                )
-            columns = {name: _column(file[GROUP], FIELDS[name], rows) for name in names}
-        return [{n: None if v is None else v[k] for n, v in columns.items()} for k in back]
+    def verdict(self, i: int) -> dict[str, Any]:
+        """Return the fields of a prediction; None for a field that the file lacks."""
+        return {name: None if v is None else v[i] for name, v in self._columns.items()}
 
     # Contents of pages.
 
@@ -195,15 +164,16 @@ class Predictions(Gallery):
         """Return the content of the cards of predictions."""
         snapshot, camera = self.snapshot, self.rows.camera
         places, cards = self._places[shown].tolist(), []
-        rows, verdicts = read_rows(snapshot, places, THUMBNAIL), self.read(shown.tolist(), ON_CARDS)
+        rows = read_rows(snapshot, places, THUMBNAIL)
         # A number that no prediction has, as a confidence, is left out.
         there = [name for name in _CARD if not np.isnan(self.table[name]).all()]
 
-        for i, at, row, verdict in zip(shown.tolist(), places, rows, verdicts, strict=True):
+        for i, at, row in zip(shown.tolist(), places, rows, strict=True):
+            verdict = self.verdict(i)
             marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
             cards.append(
                 {
-                    "strip": f"/strip/{snapshot.label(at)}-{camera}.png",
+                    "strip": f"/strip/{at}-{camera}.png",
                     "marks": marks,
                     "window": _window(marks, size),
                     "size": size,
@@ -217,18 +187,14 @@ class Predictions(Gallery):
         return cards
 
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
-        """Return the content of a prediction's page.
-
-        Raises:
-            DataError: If a file was replaced in the meantime.
-        """
+        """Return the content of a prediction's page."""
         # The verdict, the row, and where both cameras see the contacts, first the file's camera.
         snapshot, at, size = self.snapshot, int(self._places[i]), self.snapshot.config.camera.size
-        (verdict,), (row,) = self.read([i]), read_rows(snapshot, [at])
+        verdict, (row,) = self.verdict(i), read_rows(snapshot, [at])
         views = []
         for camera in sorted(CAMERAS, key=lambda name: name != self.rows.camera):
             look = read_look(snapshot, at, camera)
-            strip = f"/strip/{snapshot.label(at)}-{camera}.png"
+            strip = f"/strip/{at}-{camera}.png"
             marks = self._marks(verdict, row, camera, look)
             window = _window(marks, size, wide=camera != self.rows.camera)
             views.append({"camera": camera, "strip": strip, "marks": marks, "window": window})
@@ -239,7 +205,7 @@ class Predictions(Gallery):
             "hints": verdict.get("hints") or "",
             "trial": f"trial {at}",
             "row_words": [_outcome(row["outcome"]), *words_of(snapshot, at)],
-            "row_page": f"/grasp/{snapshot.label(at)}",
+            "row_page": f"/grasp/{at}",
             "views": views,
             "numbers": self._numbers(i, verdict, row),
             "fingers": _fingers(verdict, row),
@@ -336,12 +302,12 @@ def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) 
     return rows
 
 
-def _column(group: h5py.Group, field: Field, rows: npt.NDArray[np.int64]) -> Any:
-    """Return rows of a field; None if the file lacks it."""
+def _column(group: h5py.Group, field: Field) -> Any:
+    """Return a field of all predictions; None if the file lacks it."""
     if field.name not in group:
         return None
     column = group[field.name]
-    return (column.asstr(errors="replace") if field.dtype == "str" else column)[rows]
+    return (column.asstr(errors="replace") if field.dtype == "str" else column)[:]
 
 
 def _largest(values: Any, count: int = 1) -> Array:

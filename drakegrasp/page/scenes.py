@@ -11,7 +11,6 @@ import numpy.typing as npt
 from drakegrasp.dataset.opening import refuse_other_codes
 from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
 from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS, Shown
-from drakegrasp.dataset.trials import Stamp
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -39,7 +38,6 @@ class Scenes(Gallery):
 
     Args:
         path: Path of scenes.hdf5.
-        read_at: Stamp of the file.
         snapshot: State of the other files.
 
     Raises:
@@ -57,7 +55,7 @@ class Scenes(Gallery):
         "row": "row of the file",
     }
 
-    def __init__(self, path: Path, read_at: Stamp, snapshot: Snapshot) -> None:
+    def __init__(self, path: Path, snapshot: Snapshot) -> None:
         refuse_other_state(path, snapshot.trials)
         data = SceneDataset(path, points=None)
         scenes, grasps, views = (data.tables[name] for name in ("scenes", "grasps", "views"))
@@ -80,16 +78,6 @@ class Scenes(Gallery):
             split=scenes["split"],
             resting=scenes["resting"][:, 0],
         )
-        where = zip(self.table.object.tolist(), self.table.resting.tolist(), strict=True)
-        self._labels = [f"{snapshot.codes[number]}-{pose}" for number, pose in where]
-
-    def label(self, i: int) -> str:
-        """Return the name of a scene in addresses."""
-        return self._labels[i]
-
-    def find(self, label: str) -> int | None:
-        """Return the number of the scene with a label, or None if there is none."""
-        return self._labels.index(label) if label in self._labels else None
 
     def views(self, scene: int) -> Rows:
         """Return the rows of a scene's views."""
@@ -160,7 +148,7 @@ class Scenes(Gallery):
             along = PALM / ARROW * X_CG[None, :3, 2]
             palm = dots_of(K, X_CG[None, :3, 3], along, near, lambda finger, u, v: False)
         return {
-            "href": f"/view/{self._labels[i]}-{k}.png",
+            "href": f"/view/{i}-{k}.png",
             "size": self.data.image_size,
             "kind": VIEW_KINDS[self.data.tables["views"]["kind"][view]],
             "dots": [dot for dot in dots if np.isfinite(dot).all()],
@@ -184,7 +172,7 @@ class Scenes(Gallery):
             lines.append(
                 {
                     "trial": trial,
-                    "href": f"/grasp/{self.snapshot.label(trial)}",
+                    "href": f"/grasp/{trial}",
                     "holds": self._holds(row),
                     "outcome": ", ".join([*words, *["sample"] * bool(sample)]),
                     "seen": views,

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import socket
 import sys
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import h11
 import uvicorn
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
 
 #: The only address that the server listens on.
 LOOPBACK = "127.0.0.1"
-#: Time limit for a request to arrive completely [s].
-REQUEST_SECONDS = 30.0
 
 
 def serve(
@@ -51,53 +45,11 @@ def serve(
         inspection.warm_up()
         page = "" if results is None else "predictions"
         address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/{page}"
-        config = server_config(make_app(inspection))
         announce(address)
         if browser and has_screen():
             webbrowser.open(address)
+        config = uvicorn.Config(make_app(inspection), log_level="warning", access_log=False)
         uvicorn.Server(config).run(sockets=[listener])
-
-
-def server_config(app: Any) -> uvicorn.Config:
-    """Return the server's configuration for an ASGI app."""
-    return uvicorn.Config(app, http=_TimedProtocol, log_level="warning", access_log=False)
-
-
-class _TimedProtocol(H11Protocol):
-    """HTTP that closes a connection if a request does not arrive completely in time.
-
-    uvicorn (0.54) would wait for the rest of a request forever.
-    """
-
-    _deadline: asyncio.TimerHandle | None = None
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Wait for the first request."""
-        super().connection_made(transport)
-        self._await_request()
-
-    def on_response_complete(self) -> None:
-        """Wait for the next request."""
-        super().on_response_complete()
-        self._await_request()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Stop waiting."""
-        self._stop_waiting()
-        super().connection_lost(exc)
-
-    def _await_request(self) -> None:
-        self._stop_waiting()
-        self._deadline = self.loop.call_later(REQUEST_SECONDS, self._close_if_unfinished)
-
-    def _stop_waiting(self) -> None:
-        if self._deadline is not None:
-            self._deadline.cancel()
-
-    def _close_if_unfinished(self) -> None:
-        # A complete request is being answered.
-        if self.conn.their_state in (h11.IDLE, h11.SEND_BODY):
-            self.transport.close()
 
 
 def listen(port: int) -> socket.socket:

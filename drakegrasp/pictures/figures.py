@@ -24,7 +24,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import DataError, MachineError, counted
+from drakegrasp.errors import DataError, counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
@@ -35,8 +35,7 @@ from drakegrasp.pictures.charts import (
     draw_distributions,
     draw_objects,
 )
-from drakegrasp.pictures.rendered import phases_figure
-from drakegrasp.pictures.sheets import class_sheets, sample_sheet, scene_views
+from drakegrasp.pictures.sheets import sample_sheet, scene_views
 from drakegrasp.pictures.style import png_bytes, svg_bytes
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
@@ -62,8 +61,8 @@ COLUMNS = (
 )
 #: Why a figure of samples is left out.
 NO_SAMPLE = "no attempt became a sample"
-#: A figure or the pages of a figure, with its numbers.
-Drawn: TypeAlias = tuple[Figure | list[Figure], Any]
+#: A figure with its numbers.
+Drawn: TypeAlias = tuple[Figure, Any]
 
 
 @dataclass(kw_only=True)
@@ -101,7 +100,6 @@ def write_figures(
     out: Path,
     folder: Path,
     *,
-    trial_id: int | None = None,
     progress: Report = silent,
 ) -> Written:
     """Write the figures of a dataset, each as PNG and SVG, and their numbers.
@@ -111,20 +109,16 @@ def write_figures(
     Args:
         out: Directory of a dataset.
         folder: Folder to write to; files with the same names are replaced.
-        trial_id: The grasp whose phases are drawn; the first of those that hold best if None.
         progress: Called after each figure.
 
     Raises:
-        DataError: If the directory is not a dataset, or if `trial_id` does not fit it.
-        MachineError: If OpenGL failed and `trial_id` was given.
+        DataError: If the directory is not a dataset.
         OSError: If a file cannot be written.
     """
     samples = read_samples(out)
     read_manifest(out)  # a damaged manifest must raise an error and not just omit some figures
     funnel = count_funnel(out)
     drawings: dict[str, Callable[[], Drawn]] = {
-        "phases": lambda: _phases(out, samples, trial_id),
-        "classes": lambda: _classes(out),
         "sheet": lambda: _sheet(out),
         "outcomes": lambda: _outcomes(funnel),
         "hold": lambda: _hold(samples, funnel),
@@ -137,28 +131,21 @@ def write_figures(
     if not (out / SCENES_FILE).exists():
         del drawings["views"]  # most datasets have no scenes
 
-    # The phases of a grasp that was asked for must be drawn; all else only if there are data.
-    asked = {"phases": trial_id is not None}
+    # A figure is drawn if there are data.
     written, numbers = Written(folder=folder), {}
     for done, (name, draw) in enumerate(drawings.items(), start=1):
         try:
             with _plain_style():
-                found, numbers[name] = draw()
-                pages = [found] if isinstance(found, Figure) else found
-                for i, figure in enumerate(pages, start=1):
-                    part = name if found is figure else f"{name}_{i}"
-                    for suffix, content in ((".png", png_bytes), (".svg", svg_bytes)):
-                        write_atomic(folder / f"{part}{suffix}", content(figure, dpi=DPI))
-                    written.names.append(part)
-        except (DataError, MachineError) as error:
-            if asked.get(name):
-                raise
+                figure, numbers[name] = draw()
+                for suffix, content in ((".png", png_bytes), (".svg", svg_bytes)):
+                    write_atomic(folder / f"{name}{suffix}", content(figure, dpi=DPI))
+            written.names.append(name)
+        except DataError as error:
             written.left_out[name] = str(error)
         progress(done, len(drawings))
 
-    # Delete figures of an earlier run that this run did not draw; a sheet of classes has pages.
-    names = {*known, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
-    for name in names.difference(written.names):
+    # Delete figures of an earlier run that this run did not draw.
+    for name in known.difference(written.names):
         for suffix in (".png", ".svg"):
             (folder / f"{name}{suffix}").unlink(missing_ok=True)
     text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)
@@ -211,22 +198,6 @@ def _plain_style() -> Iterator[None]:
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         warnings.filterwarnings("ignore", message="Matplotlib currently does not support")
         yield
-
-
-def _phases(out: Path, samples: Samples, trial_id: int | None) -> Drawn:
-    if trial_id is None:
-        # The first grasp of the best group that is not empty.
-        groups = [samples.groups[name] for name in ("stable", "precision", "samples")]
-        best = next((group for group in groups if group.any()), None)
-        if best is None:
-            raise DataError(NO_SAMPLE)
-        trial_id = int(samples.trial_ids[np.argmax(best)])
-    return phases_figure(out, trial_id), {"trial_id": trial_id}
-
-
-def _classes(out: Path) -> Drawn:
-    pages, trials = class_sheets(out / DATA_FILES["oto"])
-    return pages, {"trial_ids": trials}
 
 
 def _sheet(out: Path) -> Drawn:

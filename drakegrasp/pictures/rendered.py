@@ -1,74 +1,54 @@
-"""Pictures that Drake renders: a hand, the objects of an audit, and the phases of a grasp.
+"""Pictures that Drake renders: a hand, and the objects of an audit.
 
-Input: a hand; the rows of an audit; or a dataset and the number of a trial, whose poses are those
-in trials.hdf5: nothing is simulated. Output: figures. As in `vision.rendering`, all pictures must
+Input: a hand, or the rows of an audit. Output: figures. As in `vision.rendering`, all pictures must
 be rendered in one thread.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.legend_handler import HandlerTuple
-from matplotlib.lines import Line2D
 from pydrake.geometry import Cylinder, LightParameter
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drakegrasp.arithmetic import multiply, norm
-from drakegrasp.config import CameraConfig, Config
-from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.prepared_objects import load_prepared
-from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import DataError
+from drakegrasp.arithmetic import norm
+from drakegrasp.config import CameraConfig
 from drakegrasp.frames import (
-    X_WT,
     Array,
     invert_pose,
     make_pose,
-    rotate_vectors,
     transform_points,
-    unpack_pose,
 )
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import link_points
 from drakegrasp.hand.kinematics import closed_positions
 from drakegrasp.hand.shapes import pad_surfaces
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.pictures.still_scene import (
-    NO_SHADOWS,
-    SHADOWS,
-    TABLE_SIZE,
     Lighting,
     Poses,
     StillScene,
     camera_pose,
 )
 from drakegrasp.pictures.style import (
-    ARROW,
     FINGER_COLOURS,
     INK,
     add_axes,
-    draw_marks,
     hide_ticks,
     new_page,
     save_figure,
     shortened,
-    show_image,
     write_beside,
 )
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.vision.camera import camera_pose_oto, intrinsics, unproject
 from drakegrasp.vision.rendering import build_renderer, drawn_mesh, render
 
 #: Fraction by which the hand has closed in each panel, and the title of the panel.
@@ -105,18 +85,6 @@ FIELD_DEG, FILL = 30.0, 0.95
 STATUS_COLOURS = {"fit": "#009E73", "repaired": "#B07A00", "refused": "#D55E00"}
 #: Characters of a name that fit above a picture, and of a reason that fit in a line of a picture.
 NAME, LINE = 24, 24
-#: Colours of the line of sight and of the field of view, as in the paper.
-SIGHT, FIELD = "#D81B9A", "#1F4FD8"
-#: How far the field of view is drawn [m].
-FIELD_DEPTH = 0.1
-#: Edge of a picture [px] and in the figure [inch]; spaces between pictures, for titles and legend.
-PIXELS, EDGE, GAP, TITLE, LEGEND = 720, 4.0, 0.1, 0.56, 0.34
-#: Azimuths between the line of sight and the view, which shows it from the side [rad].
-SIDE_VIEWS = np.deg2rad([-105.0, -90.0, -75.0, -60.0, 60.0, 75.0, 90.0, 105.0])
-#: Edge of the table [m]: the light does not reach farther.
-TABLE = 0.9
-#: A line of sight has no azimuth if its horizontal part is below this.
-VERTICAL = 1e-3
 
 
 # A hand.
@@ -282,180 +250,3 @@ def _wrapped(text: str) -> str:
             lines.append("")
         lines[-1] = f"{lines[-1]} {word}".strip()
     return "\n".join(lines[:12])
-
-
-# The phases of a grasp.
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrialStages:
-    """A trial at its three stages, and the scene in which they are rendered.
-
-    Attributes:
-        scene: Scene of the trial's object and hand.
-        place, close, lift: Poses at the start, after closing, and after the lift.
-        model: The object.
-        config: Configuration of the dataset.
-        row: Fields of the trial in `/trials`, by name.
-        palm_distance: Distance of the palm from the surface along +Gz [m]; NaN if the palm was
-            tried as it is and does not look at the object.
-    """
-
-    scene: StillScene
-    place: Poses
-    close: Poses
-    lift: Poses
-    model: ObjectModel
-    config: Config
-    row: Mapping[str, Any]
-    palm_distance: float
-
-    def normals(self, when: Literal["closed", "lifted"]) -> dict[str, tuple[Array, Array]]:
-        """Return the tail and tip (3,) in {W} [m] of each contact's normal, by Q and finger."""
-        X_WO = self.close.X_WO if when == "closed" else self.lift.X_WO
-        p_WQ = transform_points(X_WO, self.row[f"{when}_p_OQ"])
-        tips = p_WQ + ARROW * rotate_vectors(X_WO, self.row[f"{when}_nhat_Q_O"])
-        touching = self.row[f"{when}_touching"]
-        return {f"Q{k + 1}": (p_WQ[k], tips[k]) for k in np.flatnonzero(touching)}
-
-
-def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> TrialStages:
-    """Return a lifted trial, ready to be rendered.
-
-    Args:
-        out: Directory of the dataset.
-        trial_id: Row of trials.hdf5.
-        table_size: Edge of the table [m].
-
-    Raises:
-        DataError: If the trial does not exist, or ended before the lift.
-    """
-    # Read the trial.
-    row = Trials(out).trial(trial_id)
-    name = row["object_name"]
-    config = read_manifest(out).config_of(name)
-    outcome = Outcome(int(row["outcome"]))
-    if outcome.stage is not Stage.LIFTED:
-        raise DataError(f"{out}: trial {trial_id} must have been lifted, got {outcome.label}")
-
-    # Poses of palm and object at the start, and after the lift.
-    X_WO = X_WT @ unpack_pose(row["X_TO"])
-    X_WG = X_WO @ unpack_pose(row["X_OG"])
-    X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
-    X_WG_lifted = X_WO_lifted @ unpack_pose(row["X_OG_lifted"])
-
-    prepared = load_prepared(out, name, config)
-    model, standoffs = prepared.model, np.array(config.candidates.standoffs)
-    place = np.array([int(row["candidate"])]), standoffs[[int(row["standoff_index"])]]
-    scene = StillScene(load_hand(config.hand_source), model, table_size=table_size)
-    return TrialStages(
-        scene=scene,
-        place=Poses(X_WG=X_WG, q=scene.positions(float(row["spread"])), X_WO=X_WO),
-        close=Poses(X_WG=X_WG, q=row["closed_q"], X_WO=X_WO),
-        lift=Poses(X_WG=X_WG_lifted, q=row["lifted_q"], X_WO=X_WO_lifted),
-        model=model,
-        config=config,
-        row=row,
-        palm_distance=float(prepared.candidates.palm_distance(*place)[0]),
-    )
-
-
-def frustum(X_WC: Array, K: Array, size: int, depth: float) -> list[Array]:
-    """Return polylines (n, 3) in {W} of a camera's field of view, up to a depth [m]."""
-    edge = size - 0.5
-    pixels = np.array([[-0.5, -0.5], [edge, -0.5], [edge, edge], [-0.5, edge]])
-    corners = transform_points(X_WC, unproject(K, pixels, np.full(4, depth)))
-    rays = [np.vstack([X_WC[:3, 3], corner]) for corner in corners]
-    return [np.vstack([corners, corners[:1]]), *rays]
-
-
-def phases_figure(out: Path, trial_id: int) -> Figure:
-    """Return three pictures of a trial from the side: start, closed, lifted.
-
-    Args:
-        out: Directory of the dataset.
-        trial_id: Row of trials.hdf5.
-
-    Raises:
-        DataError: If the trial does not exist, or ended before the lift.
-        MachineError: If OpenGL failed.
-    """
-    # The camera at the pose in which it took the images, before the hand closes.
-    trial = load_trial(out, trial_id, table_size=TABLE)
-    camera = trial.config.camera
-    X_TG = multiply(invert_pose(X_WT), trial.place.X_WG)
-    X_WC = multiply(X_WT, camera_pose_oto(X_TG, camera, unpack_pose(trial.row["X_C0C"])))
-    distance = trial.palm_distance
-    end = X_WC[:3, 3] + (camera.distance + np.nan_to_num(distance)) * X_WC[:3, 2]
-    strokes = {
-        SIGHT: [np.vstack([X_WC[:3, 3], end])],
-        FIELD: frustum(X_WC, intrinsics(camera), camera.size, FIELD_DEPTH),
-    }
-
-    # The texts of the pictures. The picture of the lift also shows the table's centre.
-    force, slip = float(norm(trial.row["closed_f_Q_O"]).max()), 1e3 * float(trial.row["slip"])
-    turn, table = np.rad2deg(float(trial.row["turn"])), X_WT[None, :3, 3]
-    start = "start"
-    if np.isfinite(distance):
-        start += f"\npalm {1e3 * distance:.0f} mm from the surface"
-    closed = f"closed\nlargest force of a fingertip {force:.0f} N"
-    lifted = f"lifted\nslip {slip:.1f} mm, turn {turn:.1f}° in the hand"
-
-    # All three pictures are from the same side.
-    azimuth, elevation = _side(trial, X_WC)
-    width, height = 3 * (EDGE + GAP) + GAP, TITLE + EDGE + LEGEND
-    figure = new_page(width, height)
-    for k, (title, poses, arrows, more, lighting) in enumerate(
-        (
-            (start, trial.place, {}, [], SHADOWS),
-            (closed, trial.close, trial.normals("closed"), [], SHADOWS),
-            (lifted, trial.lift, trial.normals("lifted"), [table], NO_SHADOWS),
-        )
-    ):
-        around = np.vstack([trial.scene.outline(poses), X_WC[None, :3, 3], *more])
-        view = camera_pose(around, azimuth, elevation)
-        picture = trial.scene.picture(view, (PIXELS, PIXELS), lighting)
-        axes = add_axes(figure, GAP + k * (EDGE + GAP), TITLE, EDGE, EDGE)
-        show_image(axes, picture.image)
-        draw_marks(axes, picture, strokes=strokes, points={"C": X_WC[:3, 3]}, arrows=arrows)
-        stage, _, detail = title.partition("\n")
-        write_beside(axes, 0.0, 1.072, f"{k + 1}  {stage}", 12.0, weight="bold")
-        write_beside(axes, 0.0, 1.018, detail, 9.5)
-    _draw_phases_legend(figure, camera)
-    name = f"{shortened(trial.model.name, 30)}, trial {trial_id}"
-    figure.text(1.0 - GAP / width, 0.1 / height, name, fontsize=9, color=INK, ha="right",
-                va="bottom", parse_math=False)  # fmt: skip
-    return figure
-
-
-def _side(trial: TrialStages, X_WC: Array) -> tuple[float, float]:
-    """Return azimuth and elevation [rad] of the side view that sees the closed fingers best."""
-    # If the camera looks straight down, any side is suitable.
-    x, y, _ = X_WC[:3, 2]
-    along = 0.0 if np.hypot(x, y) < VERTICAL else float(np.arctan2(y, x))
-    X_WV = trial.scene.choose_view(trial.scene.outline(trial.close), azimuths=along + SIDE_VIEWS)
-    x, y, z = -X_WV[:3, 2]
-    return float(np.arctan2(y, x)), float(np.arcsin(z))
-
-
-def _draw_phases_legend(figure: Figure, camera: CameraConfig) -> None:
-    """Draw the legend of the colours."""
-    dots = [
-        Line2D([], [], color=colour, marker="o", linestyle="none", markeredgecolor="white",
-               markersize=8) for colour in FINGER_COLOURS[:3]
-    ]  # fmt: skip
-    field = f"field of view, {camera.fov_y_deg:g}°"
-    marks: dict[str, Any] = {
-        "line of sight of the camera C": Line2D([], [], color=SIGHT, linewidth=1.6),
-        f"{field}; C stands {camera.distance:g} m behind the palm": Line2D(
-            [], [], color=FIELD, linewidth=1.6
-        ),
-        "contacts, with their outward normals": tuple(dots),
-    }
-    figure.legend(
-        handles=list(marks.values()), labels=list(marks),
-        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.2)},
-        loc="lower left", bbox_to_anchor=(GAP / figure.get_figwidth(), 0.02), ncols=len(marks),
-        fontsize=9, frameon=False, borderaxespad=0.0, borderpad=0.0, labelcolor=INK,
-        columnspacing=1.6,
-    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Overview figures with a grid of samples: of each object, of each class, and of training scenes.
+"""Overview figures with a grid of samples: of each object, and of training scenes.
 
 Input: a data file or scenes.hdf5. Output: figures. Needs matplotlib, but not Drake.
 """
@@ -36,8 +36,6 @@ from drakegrasp.vision.camera import project
 
 #: Samples per line of a sheet, and the edge of each of its images [inch].
 ACROSS, EDGE = 3, 1.12
-#: Number of classes on a page.
-PER_PAGE = 24
 #: Number of samples on the sheet of a dataset, and the most if it has more objects than that.
 PLACES, MOST = 24, 60
 #: Sheet of scenes: scenes of each split, views of a scene, and the width of a view [inch].
@@ -52,7 +50,6 @@ def draw_sheet(
     K: Array,
     *,
     far: float,
-    titles: Sequence[str] | None = None,
     note: str = "",
 ) -> Figure:
     """Return the contact sheet of samples as a figure.
@@ -63,7 +60,6 @@ def draw_sheet(
         samples: Samples to draw, at least one.
         K: (3, 3), camera matrix [px].
         far: Far plane of the camera [m].
-        titles: Text above each sample; the name of its object if None.
         note: Text below all samples.
     """
     # The page: blocks of three images, below a head with legend and colour bar.
@@ -86,8 +82,8 @@ def draw_sheet(
         top = head + line * (EDGE + caption) + caption
         axes = [add_axes(figure, left + k * (EDGE + gap), top, EDGE, EDGE) for k in range(3)]
         draw_sample(axes, sample, K, near=nearest, far=far, scale=0.75)
-        title = str(sample.props["object_name"]) if titles is None else titles[i]
-        write_beside(axes[0], 0.0, 1.05, title.replace("_", " "), 7.0)
+        name = str(sample.props["object_name"]).replace("_", " ")
+        write_beside(axes[0], 0.0, 1.05, name, 7.0)
         trial = f"trial {sample.trial_id}"
         write_beside(axes[2], 1.0, 1.05, trial, 6.0, color="#888888", ha="right")
 
@@ -166,38 +162,6 @@ def _natural(name: str) -> tuple[int, str]:
     """Return the sorting key of a name: its leading number, then the rest."""
     number, _, rest = name.partition("_")
     return (int(number), rest) if number.isdecimal() else (10**9, name)
-
-
-def class_sheets(path: Path) -> tuple[list[Figure], dict[str, int]]:
-    """Return pages with a sample of each class, and the trial id of each of these samples.
-
-    The sample with the lowest trial id of each class is drawn, without further selection; the
-    classes are in the order of their names.
-
-    Args:
-        path: A data file.
-
-    Raises:
-        DataError: If the file is not a data file or contains no sample.
-    """
-    # The first sample of each class.
-    first: dict[str, tuple[int, GraspDataset, int]] = {}
-    for split in SPLITS:
-        data = GraspDataset(path, split=split, fewer_fingers=True)
-        ids, classes = data.column("trial_id"), data.column("object_props/class_name")
-        for row, (trial, name) in enumerate(zip(ids.tolist(), classes.tolist(), strict=True)):
-            if name not in first or trial < first[name][0]:
-                first[name] = trial, data, row
-    if not first:
-        raise DataError(f"{path}: must hold at least one sample to draw, got none")
-
-    # Pages of as many classes as fit.
-    names, far, pages = sorted(first), read_far(path), []
-    for start in range(0, len(names), PER_PAGE):
-        shown = names[start : start + PER_PAGE]
-        samples: list[Sample] = [first[name][1][first[name][2]] for name in shown]
-        pages.append(draw_sheet(samples, first[shown[0]][1].K, far=far, titles=shown))
-    return pages, {name: first[name][0] for name in names}
 
 
 def scene_views(path: Path) -> tuple[Figure, list[dict[str, int]]]:

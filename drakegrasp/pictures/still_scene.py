@@ -105,15 +105,6 @@ SHADOWS = Lighting(
         ),
     ),
 )
-#: For pictures of the lift. The last light has no shadows: seen from it, the table is far behind
-#: the object, so VTK's shadow map would be too coarse and draw spots on the object.
-NO_SHADOWS = Lighting(
-    name="no shadows",
-    lights=(
-        *SHADOWS.lights[:2],
-        LightParameter(type="point", frame="camera", position=[-1.0, -1.3, 0.2], intensity=0.7),
-    ),
-)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -137,7 +128,6 @@ class StillScene:
     Args:
         hand: The hand.
         model: The object; without one there is no table.
-        table_size: Edge of the square table, whose top is at {T} [m].
         add: Function that adds more shapes to the plant, before it is finalized, and to the hand's
             model instance in it.
 
@@ -152,7 +142,6 @@ class StillScene:
         hand: Hand,
         model: ObjectModel | None = None,
         *,
-        table_size: float = TABLE_SIZE,
         add: Callable[[MultibodyPlant, ModelInstanceIndex], None] | None = None,
     ) -> None:
         # The object, above a table.
@@ -162,7 +151,7 @@ class StillScene:
         if model is not None:
             self._object = add_drawn_object(plant, model)
             X_WB = RigidTransform(X_WT @ make_pose(np.eye(3), [0.0, 0.0, -TABLE_THICKNESS / 2.0]))
-            slab = Box(table_size, table_size, TABLE_THICKNESS)
+            slab = Box(TABLE_SIZE, TABLE_SIZE, TABLE_THICKNESS)
             plant.RegisterVisualGeometry(plant.world_body(), X_WB, slab, "table", TABLE_COLOUR)
 
         # The hand, whose palm can be placed anywhere.
@@ -261,9 +250,7 @@ class StillScene:
         bodies += [] if self._object is None else [self._object]
         return np.stack([labels[:, :, 0] == int(body.index()) for body in bodies])
 
-    def choose_view(
-        self, p_WA: Array, *, fill: float = 1.0, azimuths: Array | None = None
-    ) -> Array:
+    def choose_view(self, p_WA: Array) -> Array:
         """Return the pose X_WC (4, 4) of a camera that sees given points and all fingertips.
 
         A ring of viewpoints is tried. The best viewpoint is the one whose least visible fingertip
@@ -272,15 +259,11 @@ class StillScene:
 
         Args:
             p_WA: (n, 3), points that must be in the picture [m].
-            fill: Factor by which the camera's distance is divided; above 1 the points fill more of
-                the picture.
-            azimuths: Azimuths to try [rad]; all around if None.
         """
-        azimuths = np.deg2rad(AZIMUTHS_DEG) if azimuths is None else azimuths
         best, most = np.eye(4), (-1, -1)
         for elevation in np.deg2rad(ELEVATIONS_DEG):
-            for azimuth in azimuths:
-                X_WC = camera_pose(p_WA, azimuth, elevation, fill=fill)
+            for azimuth in np.deg2rad(AZIMUTHS_DEG):
+                X_WC = camera_pose(p_WA, azimuth, elevation)
                 pixels = self.seen(X_WC, (TRIAL_SIZE, TRIAL_SIZE)).sum(axis=(1, 2))
                 score = int(pixels[: self.hand.num_fingers].min()), int(pixels.sum())
                 if score > most:

@@ -7,7 +7,7 @@ arrow along the outward normal. The dot is hollow if the object hides the contac
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.reader import Sample
 from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp
-from drakegrasp.vision.camera import Picture, project
+from drakegrasp.vision.camera import project
 
 #: Colours of contacts: predicted, after closing, after the lift, and those of the dataset's own
 #: grasp (Okabe and Ito: safe for the colour-blind).
@@ -40,8 +40,6 @@ ARROW = 0.03
 HIDDEN = 0.006
 #: Colour of text and lines.
 INK = "#333333"
-#: Distance of a label from its point [points].
-LABEL_REACH = 13.0
 #: Colours of depths; on thumbnails also colours of pixels without depth, and of the mask's
 #: background and object. Empty pixels are transparent, and the object is neither dark nor light, so
 #: that it is visible on any page.
@@ -284,82 +282,8 @@ def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:
     return buffer.getvalue()
 
 
-def draw_marks(
-    axes: Axes,
-    picture: Picture,
-    *,
-    strokes: Mapping[str, Sequence[Array]] | None = None,
-    points: Mapping[str, Array],
-    arrows: Mapping[str, tuple[Array, Array]],
-    labels: Mapping[str, Array] | None = None,
-    obstacles: Sequence[Array] = (),
-) -> None:
-    """Draw lines, points and arrows over a picture, and their names where there is space.
-
-    Args:
-        axes: Axes that show the picture.
-        picture: The picture with its camera.
-        strokes: By colour, polylines (n, 3) in {W} [m].
-        points: By name, points (3,) in {W} [m].
-        arrows: By name, tail (3,) and tip (3,) in {W} [m], drawn in the colours of the fingers.
-        labels: By name, further points (3,) to be named.
-        obstacles: Arrays (n, 3) of further points in {W} that no name should cover.
-    """
-    halo = [withStroke(linewidth=3.0, foreground="white")]
-    for colour, lines in (strokes or {}).items():
-        for line in lines:
-            axes.plot(*picture.pixels(line).T, color=colour, linewidth=1.4, path_effects=halo,
-                      solid_capstyle="round")  # fmt: skip
-
-    # Contacts and other points.
-    for i, (start, end) in enumerate(arrows.values()):
-        colour = FINGER_COLOURS[i % len(FINGER_COLOURS)]
-        tail, tip = picture.pixels(np.vstack([start, end]))
-        axes.annotate("", tip, tail, zorder=6, arrowprops={
-            "arrowstyle": "-|>", "color": colour, "linewidth": 2.0, "shrinkA": 0.0, "shrinkB": 0.0,
-            "path_effects": halo, "mutation_scale": 11.0})  # fmt: skip
-        axes.plot(*tail, "o", color=colour, markersize=6.5, markeredgecolor="white", zorder=7)
-    for point in points.values():
-        axes.plot(*picture.pixels(point[None])[0], "o", color=INK, markersize=6.0,
-                  markeredgecolor="white", zorder=7)  # fmt: skip
-
-    # Names, placed where they do not cover any of these.
-    named = {**(labels or {}), **points, **{name: start for name, (start, _) in arrows.items()}}
-    drawn = [*obstacles, *(np.linspace(start, end, 4) for start, end in arrows.values())]
-    anchors = {name: picture.pixels(p[None])[0] for name, p in named.items()}
-    _draw_labels(axes, anchors, picture.pixels(np.vstack([np.zeros((0, 3)), *drawn])))
-
-
 def show_image(axes: Axes, image: npt.NDArray[np.uint8]) -> None:
     """Show an image with integer coordinates at the pixel centres."""
     axes.imshow(image, interpolation="antialiased")
     frame_image(axes, *image.shape[:2])
     axes.set_autoscale_on(False)
-
-
-def _draw_labels(axes: Axes, pixels: Mapping[str, Array], obstacles: Array) -> None:
-    """Write names beside points, each on the side with the most space.
-
-    Args:
-        axes: Axes that show the image.
-        pixels: By name, the labelled point (2,) [px].
-        obstacles: (n, 2), points that labels should not cover [px].
-    """
-    # Distance of a label from its point, converted from points of the paper to pixels of the image.
-    window = axes.get_window_extent()
-    reach = LABEL_REACH * axes.figure.dpi / 72.0 * abs(np.ptp(axes.get_xlim())) / window.width
-    angles = np.deg2rad(np.arange(0.0, 360.0, 30.0))
-    directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    taken = np.vstack([obstacles, *pixels.values()])
-
-    for name, pixel in pixels.items():
-        places = pixel + reach * directions * [1.0 + 0.25 * len(name), 1.0]
-        distances = np.linalg.norm(places[:, None] - taken[None], axis=2)
-        # The nearest obstacle has the largest weight; the next two count as well.
-        nearest = np.sort(distances, axis=1)[:, :3]
-        place = places[np.argmax(nearest @ [4.0, 2.0, 1.0][: nearest.shape[1]])]
-        taken = np.vstack([taken, place])
-        axes.text(
-            place[0], place[1], name, ha="center", va="center", fontsize=10.5, weight="bold",
-            color="black", zorder=9, path_effects=[withStroke(linewidth=3.0, foreground="white")],
-        )  # fmt: skip

@@ -423,6 +423,52 @@ def make_attempts(
     )
 
 
+def make_posture(
+    hand: Hand,
+    X_FG: npt.ArrayLike,
+    q_grasp: npt.ArrayLike | None = None,
+    q_pregrasp: npt.ArrayLike | None = None,
+    q_squeeze: npt.ArrayLike | None = None,
+    *,
+    frame: str = "object",
+    X_TO: npt.ArrayLike | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    joints: Sequence[str] | None = None,
+    preshape: str | None = None,
+) -> Posture:
+    """Return the posture of a table of one row, whose palm pose is given in one of four frames.
+
+    Args:
+        hand: The hand.
+        X_FG: Pose of the palm in the frame, (4, 4).
+        q_grasp: (j,), joint positions of the grasp [rad or m]; None if the open hand closes.
+        q_pregrasp: (j,), start of the trial.
+        q_squeeze: (j,), target of the motors beyond the grasp.
+        frame: "object" {O}, "table" {T}, "camera" {C} or "world" {W}.
+        X_TO: Pose of the object on the table, (4, 4), for any frame but "object".
+        X_TC: Pose of the camera in the table-top frame, (4, 4), for the frame "camera".
+        joints: Names of the joints in the order of the vectors; None for the plant's order. Joints
+            that the hand file couples may be missing.
+        preshape: Name of one of the hand's preshapes; None if all fingers close.
+
+    Raises:
+        GraspError: If a pose is invalid, a vector has another length or is not finite, a pregrasp
+            or a squeeze is given without a grasp, a joint is missing, the hand has no such
+            preshape, or the frame is unknown or lacks its pose.
+    """
+    if frame in ("table", "world", "camera") and X_TO is None:
+        raise GraspError(f"X_TO must be given with the frame {frame}, got None")
+    stages = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
+    poses = {"X_FG": X_FG, "X_TO": X_TO, "X_TC": X_TC}
+    row: dict[str, Any] = {
+        name: [value] for name, value in (stages | poses).items() if value is not None
+    }
+    table = make_attempts(hand, [""], **row, frame=frame, joints=joints, preshape=[preshape])
+    if table.invalid[0]:
+        raise GraspError(table.invalid[0])
+    return table.posture(0, table.X_TO[0])
+
+
 def read_confidence(stated: Any, shape: tuple[int, ...], invalid: Sequence[str] = ()) -> Array:
     """Return the confidence that is stated, an array of a shape.
 

@@ -9,17 +9,14 @@ moves from the pregrasp to the grasp and on to the squeeze.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import X_WT, Array, as_numbers, invert_pose, read_pose
+from drakegrasp.frames import Array, read_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, open_together
 from drakegrasp.hand.parsing import position_order
@@ -28,9 +25,6 @@ from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.placement import PlacedObject, config_for, refuse_other_objects
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-
-Frame = Literal["object", "table", "camera", "world"]
-FRAMES: tuple[str, ...] = get_args(Frame)
 
 #: A joint follows the hand file if it is at most this far from where the file has it (coupled
 #: joint) or from another spread joint, in units of its finger's closing joint.
@@ -71,59 +65,6 @@ class Posture:
     preshape: str | None = None
 
 
-def make_posture(
-    hand: Hand,
-    X_FG: npt.ArrayLike,
-    q_grasp: npt.ArrayLike | None = None,
-    q_pregrasp: npt.ArrayLike | None = None,
-    q_squeeze: npt.ArrayLike | None = None,
-    *,
-    frame: str = "object",
-    X_TO: npt.ArrayLike | None = None,
-    X_TC: npt.ArrayLike | None = None,
-    joints: Sequence[str] | None = None,
-    preshape: str | None = None,
-) -> Posture:
-    """Return a posture whose palm pose is given in one of four frames.
-
-    Args:
-        hand: The hand.
-        X_FG: Pose of the palm in the frame, (4, 4); (3, 4) and (12,) are also accepted.
-        q_grasp: (j,), joint positions of the grasp [rad or m]; None if the open hand closes.
-        q_pregrasp: (j,), start of the trial.
-        q_squeeze: (j,), target of the motors beyond the grasp.
-        frame: "object" {O}, "table" {T}, "camera" {C} or "world" {W}.
-        X_TO: Pose of the object on the table, (4, 4), for any frame but "object".
-        X_TC: Pose of the camera in the table-top frame, (4, 4), for the frame "camera".
-        joints: Names of the joints in the order of the vectors; None for the plant's order.
-        preshape: Name of one of the hand's preshapes; None if all fingers close.
-
-    Raises:
-        GraspError: If a pose is invalid, a vector has another length or is not finite, a pregrasp
-            or a squeeze is given without a grasp, a joint is missing, the hand has no such
-            preshape, or the frame is unknown or lacks its pose.
-    """
-    preshape_index(hand, preshape)
-    vectors = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
-    order = None if joints is None else _places(joint_order(hand), joints)
-    size = len(hand.joint_names) if joints is None else len(joints)
-    q: dict[str, Array | None] = dict.fromkeys(vectors)
-    for name, value in vectors.items():
-        if value is None:
-            continue
-        if q_grasp is None:
-            raise GraspError(f"{name} must be {BESIDE_GRASP}")
-        vector = as_numbers(value, f"{name} must be {size} joint positions")
-        if vector.shape != (size,) or not np.isfinite(vector).all():
-            got = "numbers that are not" if vector.shape == (size,) else f"shape {vector.shape}"
-            raise GraspError(f"{name} must be {size} finite joint positions, got {got}")
-        q[name] = vector if order is None else vector[order]
-
-    X_OF = _frame_in_object(frame, X_TO, X_TC)
-    X_OG = multiply(X_OF, exact_pose(X_FG, "the palm's pose"))
-    return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"], preshape)
-
-
 def preshape_index(hand: Hand, name: str | None) -> int | None:
     """Return the index of a preshape by its name; None for None.
 
@@ -136,25 +77,6 @@ def preshape_index(hand: Hand, name: str | None) -> int | None:
         known = f"one of {', '.join(hand.preshape_names)}" if hand.preshapes else "left out"
         raise GraspError(f"preshape must be {known} for the hand {hand.name}, got {name!r}")
     return hand.preshape_names.index(name)
-
-
-def _frame_in_object(frame: str, X_TO: npt.ArrayLike | None, X_TC: npt.ArrayLike | None) -> Array:
-    """Return the pose (4, 4) of a frame in {O}."""
-    if frame not in FRAMES:
-        raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
-    if (X_TC is None) == (frame == "camera"):
-        got = "none" if X_TC is None else f"a pose with frame {frame!r}"
-        raise GraspError(f"X_TC must be given with the frame camera, and only then, got {got}")
-    if frame == "object":
-        return np.eye(4)
-    if X_TO is None:
-        raise GraspError(f"X_TO must be given with the frame {frame}, got None")
-    X_OT = invert_pose(exact_pose(X_TO, "X_TO"))
-    if frame == "table":
-        return X_OT
-    if frame == "world":
-        return multiply(X_OT, invert_pose(X_WT))
-    return multiply(X_OT, exact_pose(X_TC, "X_TC"))  # type: ignore[arg-type]
 
 
 def exact_pose(X: npt.ArrayLike, name: str) -> Array:
@@ -175,16 +97,22 @@ def joint_order(hand: Hand) -> tuple[str, ...]:
     return position_order(hand.model, hand.palm_link)
 
 
-def _places(order: Sequence[str], joints: Sequence[str]) -> list[int]:
-    """Return the index of each of the hand's joints in given names; each must be given once."""
-    given = list(joints)
-    for joint in order:
-        if given.count(joint) != 1:
-            raise GraspError(
-                f"joints must name each joint of the hand once ({', '.join(order)}), "
-                f"got {joint!r} {given.count(joint)} times"
-            )
-    return [given.index(joint) for joint in order]
+def refuse_misfit(posture: Posture, hand: Hand) -> None:
+    """Reject a posture that is not one of a hand.
+
+    Raises:
+        GraspError: If the pose or a vector is invalid, or a pregrasp or a squeeze is given alone.
+    """
+    exact_pose(posture.X_OG, "the palm's pose")
+    size = len(hand.joint_names)
+    for name in ("q_grasp", "q_pregrasp", "q_squeeze"):
+        q = getattr(posture, name)
+        if q is None:
+            continue
+        if posture.q_grasp is None:
+            raise GraspError(f"{name} must be {BESIDE_GRASP}")
+        if np.shape(q) != (size,) or not np.isfinite(q).all():
+            raise GraspError(f"{name} must be {size} finite joint positions, got others")
 
 
 # The trial of a posture
@@ -304,7 +232,7 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
 
     Args:
         placed: The object on the table, see `place_object`.
-        posture: Wrist and joints, see `make_posture`.
+        posture: Wrist and joints, see `simulation.attempts.make_posture`.
         config: Hand, physics and lift; None for the configuration of the placed object.
 
     Raises:
@@ -319,8 +247,8 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
     config = with_whole_lifts(config_for(placed, config))
     refuse_other_objects(config, placed.config, "as the object was placed with")
     hand = load_hand(config.hand_source)
-    vectors = posture.q_grasp, posture.q_pregrasp, posture.q_squeeze
-    start = start_of(make_posture(hand, posture.X_OG, *vectors, preshape=posture.preshape), hand)
+    refuse_misfit(posture, hand)
+    start = start_of(posture, hand)
     scene = cached_scene(placed.model, config.physics, config.hand_source, start.preshape)
     trial = run_attempt(scene, placed.X_TO_simulated, start, config)
 

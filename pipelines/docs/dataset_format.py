@@ -73,8 +73,7 @@ path, by a path that leads out of its folder, or by `package://`, the model is r
 files are stored in `hand/files/`. `versions` in the manifest contains a digest of hand file, model
 and meshes without their paths. A build continues with a hand of the same digest, wherever
 the hand is and whatever the name of its file; `merge` requires the same digest, and `check`
-compares it. Datasets of version 0.2 and before have no `hand/`: a hand of the package is then the
-installed one, a hand file is read at its path, and a build that continues adds the folder.
+compares it.
 """
 
 _CONTRACT = """## What makes two files equal

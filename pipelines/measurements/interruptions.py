@@ -1,7 +1,7 @@
 """Interrupt builds at many points; the same command must then finish with equal arrays.
 
 \b
-    python pipelines/measurements/interruptions.py disk [--amounts N] [--only build|assemble]
+    python pipelines/measurements/interruptions.py disk [--amounts N]
     python pipelines/measurements/interruptions.py kills [--rounds N]
 
 `disk`, which needs root, runs a build and `assemble` in a file system in memory (tmpfs) that
@@ -30,6 +30,7 @@ from typing import Any
 import click
 import h5py
 import numpy as np
+import psutil
 import trimesh
 
 from drakegrasp.dataset.lock import tidy
@@ -204,7 +205,7 @@ def kill_in(
     while not has_newer(out, signs[phase], since) and process.poll() is None:
         time.sleep(0.002)
     time.sleep(delay)
-    workers = children(process.pid)
+    workers = psutil.Process(process.pid).children()
     process.kill()
     if process.wait() == 0:
         return None
@@ -246,24 +247,11 @@ def has_one_state(out: Path) -> bool:
     return (len(there) in (0, len(DATA)) and len(states) <= 1) or not is_assembled(out)
 
 
-def children(client: int) -> list[int]:
-    """Return the ids of the processes that a process started."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-        except (OSError, IndexError):
-            continue
-        if parent == client:
-            found.append(int(folder.name))
-    return found
-
-
-def runs(pid: int) -> bool:
+def runs(process: psutil.Process) -> bool:
     """Return whether a process is still running."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
+        return bool(process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
         return False
 
 
@@ -314,8 +302,7 @@ def main() -> None:
 
 @main.command()
 @click.option("--amounts", default=20, show_default=True)
-@click.option("--only", type=click.Choice(["build", "assemble"]))
-def disk(amounts: int, only: str | None) -> None:
+def disk(amounts: int) -> None:
     """Fill the disk under a build and under `assemble`."""
     wrong = 0
     with references() as (meshes, reference, folder):
@@ -326,8 +313,6 @@ def disk(amounts: int, only: str | None) -> None:
         needs = {"build": used(reference), "assemble": used(reference, DATA)}
         commands = {"build": build_command(meshes, out), "assemble": [*MAIN, "assemble", str(out)]}
         for kind, command in commands.items():
-            if only not in (None, kind):
-                continue
             content = reference if kind == "assemble" else None
             for number in range(amounts):
                 # Sizes from one page to slightly too little.

@@ -1,21 +1,14 @@
-"""Try stored attempts of a dataset again under changed conditions, and report how they end.
+"""Try stored attempts of a dataset again with other settings, and report how they end.
 
     python pipelines/measurements/relift.py OUT --count 256 --set physics.time_step=0.002
     python pipelines/measurements/relift.py OUT --rows both --count 300 --set lift.stop_when=never
     python pipelines/measurements/relift.py OUT --rows attempts --set lift.stop_when=lost_sample
-    python pipelines/measurements/relift.py OUT --rows samples --count 100 --disturbed
 
-Each attempt is tried as it is stored, and then with the settings of `--set`, or with `--disturbed`
-once for each disturbance: friction and mass changed by a fraction, up and down; half the time step;
-the palm displaced by 3 mm in a random direction and turned by 3 degrees about a random axis; and
-`together`, which changes friction, mass and palm, with random signs. Disturbed lifts always run to
-their end.
-
-The script prints JSON for each change: the number of lifts with a verdict; the numbers that are
-held and that are samples, with their intervals; the outcomes that differ from those as stored; and
-CPU seconds. Samples are judged by the filters except those that need pictures, the outlier filter
-and user-defined filters. For lifts it also prints the medians of slip, turn, force and of how far a
-closing joint opened.
+Each attempt is tried as it is stored, and then with the settings of `--set`. The script prints JSON
+for both: the number of lifts with a verdict; the numbers that are held and that are samples, with
+their intervals; the outcomes that differ from those as stored; and CPU seconds. Samples are judged
+by the filters except those that need pictures, the outlier filter and user-defined filters. For
+lifts it also prints the medians of slip, turn, force and of how far a closing joint opened.
 """
 
 from __future__ import annotations
@@ -25,8 +18,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -35,13 +27,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import binomtest
 
-from drakegrasp.arithmetic import multiply
-from drakegrasp.config import Config, with_whole_lifts
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
-from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.generation.attempts import find_attempt, judge_sample
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import override_config
@@ -49,40 +39,14 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.conditions import usual_conditions
 from drakegrasp.simulation.scene_cache import cached_scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: Results of an attempt under one change, or of all attempts.
 Found = dict[str, Any]
-#: Changes of friction and mass as fractions, and of the palm's position [m] and rotation [rad].
-FRICTION, MASS, SHIFT, TURN = 0.15, 0.20, 3e-3, np.deg2rad(3.0)
-#: Number of lifts of each sample with only the palm displaced, and with all changes.
-PALMS, TOGETHER = 2, 4
 #: Last number of the keys of the random streams.
 PLACE = 25
 STORED, SET = "as stored", "as set"
-
-
-def disturbances(stream: Stream) -> Iterator[tuple[str, float, float, bool]]:
-    """Yield each change: its name, factors of friction and mass, whether the palm is displaced."""
-    yield "half step", 1.0, 1.0, False
-    for sign in (-1.0, 1.0):
-        yield f"friction {sign * FRICTION:+.0%}", 1.0 + sign * FRICTION, 1.0, False
-        yield f"mass {sign * MASS:+.0%}", 1.0, 1.0 + sign * MASS, False
-    for _ in range(PALMS):
-        yield "palm", 1.0, 1.0, True
-    for _ in range(TOGETHER):
-        friction, mass = (2.0 * stream.integers(2, 2) - 1.0).tolist()
-        yield "together", 1.0 + friction * FRICTION, 1.0 + mass * MASS, True
-
-
-def palm_off(attempt: Attempt, stream: Stream) -> Attempt:
-    """Return an attempt with the palm displaced in a random direction and about a random axis."""
-    shift, axis = (v / np.linalg.norm(v) for v in stream.normal(6).reshape(2, 3))
-    X_GH = make_pose(rotation_about(axis, TURN), SHIFT * shift)
-    return replace(attempt, X_OG=multiply(attempt.X_OG, X_GH))
 
 
 def chosen_rows(out: Path, kind: str, count: int, seed: int) -> npt.NDArray[np.int64]:
@@ -104,54 +68,40 @@ def chosen_rows(out: Path, kind: str, count: int, seed: int) -> npt.NDArray[np.i
 
 
 def try_again(
-    out: Path, trial_id: int, stored: Config, other: Config | None, prepared: Any
+    out: Path,
+    trial_id: int,
+    stored: Config,
+    other: Config,
+    prepared: Callable[[str], PreparedObject],
 ) -> list[Found]:
-    """Return the results of an attempt as stored, and under each change.
+    """Return the results of an attempt as stored, and with the changed settings.
 
     Args:
         out: Directory of the dataset.
         trial_id: Id of the attempt.
         stored: Configuration of the dataset.
-        other: Configuration with the changed settings; None to disturb the attempt instead.
+        other: Configuration with the changed settings.
         prepared: Function that returns a prepared object of the dataset by its name.
     """
     row = Trials(out).trial(trial_id)
     model = prepared(row["object_name"])
-    candidate, standoff = (int(row[k]) for k in ("candidate", "standoff_index"))
-    attempt = find_attempt(model, candidate, standoff, stored)
-    known = attempt.conditions or usual_conditions(model.model, stored.physics)
-    X_TO = model.resting_poses[attempt.resting]
     hand = load_hand(stored.hand_source)
-
-    def once(change: str, attempt: Attempt, rules: Config) -> Found:
+    # The palm pose is that of the stored settings, friction and mass are those of the others.
+    drawn = {"physics": other.physics, "randomize": other.randomize}
+    found = []
+    for change, draw, rules in (
+        (STORED, stored, stored),
+        (SET, stored.model_copy(update=drawn), other),
+    ):
+        candidate, standoff = int(row["candidate"]), int(row["standoff_index"])
+        attempt = find_attempt(model, candidate, standoff, draw)
         scene = cached_scene(model.model, rules.physics, rules.hand_source, attempt.preshape)
         start = time.process_time()
-        record = run_attempt(scene, X_TO, attempt, rules)
+        record = run_attempt(scene, model.resting_poses[attempt.resting], attempt, rules)
         spent = time.process_time() - start
         removal = judge_sample(model.model, record, rules, views=False)
         told = {"outcome": record.outcome.label, "sample": removal is Removal.KEPT}
-        return {"change": change, **told, "seconds": spent, **measured(hand, record)}
-
-    if other is not None:
-        # Friction and mass are those of the requested settings.
-        asked = {"physics": other.physics, "randomize": other.randomize}
-        rules = stored.model_copy(update=asked)
-        again = find_attempt(model, candidate, standoff, rules)
-        both = ((STORED, attempt, stored), (SET, again, other))
-        return [once(name, each, by) for name, each, by in both]
-    whole = with_whole_lifts(stored)
-    half = {"time_step": whole.physics.time_step / 2.0, "coarse_steps": 1}
-    finer = whole.model_copy(update={"physics": whole.physics.model_copy(update=half)})
-    stream, found = Stream(stored.seed, trial_id, PLACE), [once(STORED, attempt, whole)]
-    for change, friction, mass, is_off in disturbances(stream):
-        materials = replace(
-            known.materials,
-            friction_hand=friction * known.materials.friction_hand,
-            mass=mass * known.materials.mass,
-        )
-        changed = replace(attempt, conditions=replace(known, materials=materials))
-        changed = palm_off(changed, stream) if is_off else changed
-        found.append(once(change, changed, finer if change == "half step" else whole))
+        found.append({"change": change, **told, "seconds": spent, **measured(hand, record)})
     return found
 
 
@@ -223,16 +173,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--rows", default="lifts", choices=("attempts", "lifts", "samples", "both"))
     parser.add_argument("--count", type=int, default=100, help="rows of each kind (default: 100)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings")
-    parser.add_argument(
-        "--disturbed", action="store_true", help="disturb each attempt, instead of --set"
-    )
     arguments = parser.parse_args(argv)
-    if arguments.disturbed and arguments.settings:
-        parser.error("--disturbed must be used without --set")
 
     out, rows = arguments.dataset, list[list[Found]]()
     config = read_manifest(out).config
-    other = None if arguments.disturbed else override_config(config, arguments.settings)
+    other = override_config(config, arguments.settings)
     prepared = lru_cache(1)(lambda name: load_prepared(out, name, config))
     ids = chosen_rows(out, arguments.rows, arguments.count, config.seed)
     with progress_bar("attempts", "attempts") as report:

@@ -17,14 +17,14 @@ def test_figures_are_written_beside_the_dataset(
     def refuse(*_: object) -> None:
         raise DataError("not in this test")
 
-    monkeypatch.setattr(figures, "_phases", refuse)
+    monkeypatch.setattr(figures, "_sheet", refuse)
     for name in ("png_bytes", "svg_bytes"):
         monkeypatch.setattr(figures, name, lambda figure, *, dpi: b"")
     result = run("figures", out, "--quiet")
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines() == [
-        "phases is left out: not in this test",
-        f"7 figures in {out / 'figures'}",
+        "sheet is left out: not in this test",
+        f"5 figures in {out / 'figures'}",
     ]
     assert (out / "figures" / "hold.svg").is_file()
     # A build that goes on, and a second run, are not disturbed by them.

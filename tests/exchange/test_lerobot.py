@@ -235,7 +235,7 @@ def test_same_attempts_give_the_same_bytes(export: Callable[..., Path]) -> None:
         ("lerobot", {"attempts": "held"}, "attempts must be one of samples, failed, all, got"),
         ("lerobot", {"fps": 0}, "fps must be a whole number from 1 to 120, got 0"),
         ("lerobot", {"fps": 12.5}, "fps must be a whole number from 1 to 120, got 12.5"),
-        ("lerobot", {"publication": 1}, "publication must be left out with format lerobot, got 1"),
+        ("lerobot", {"licence": "mit"}, "licence must be left out with format lerobot, got 'mit'"),
         ("glb", {"fps": 10}, "fps must be left out with format glb, got 10"),
     ],
 )

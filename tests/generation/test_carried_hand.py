@@ -101,13 +101,6 @@ def test_its_grasps_are_verified(passed_on: Path) -> None:
     assert verdicts and all(verdict["outcome"] != "invalid" for verdict in verdicts)
 
 
-@pytest.mark.nightly
-def test_figures_show_the_hand(passed_on: Path, tmp_path: Path) -> None:
-    result = run("figures", passed_on, "--out", tmp_path / "drawn", "--quiet")
-    assert result.exit_code == 0, result.output
-    assert {"hold.png", "phases.png"} <= {path.name for path in (tmp_path / "drawn").iterdir()}
-
-
 def test_an_export_has_the_links_of_the_hand(passed_on: Path, tmp_path: Path) -> None:
     result = run("export", passed_on, tmp_path / "scenes", "--to", "glb", "--quiet")
     assert result.exit_code == 0, result.output

@@ -16,7 +16,7 @@ from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.page.catalog import Catalog
+from drakegrasp.page.catalog import read_snapshot
 from drakegrasp.runtime.executor import run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -58,6 +58,6 @@ def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(
     assert replay_trial(report.out, row).same
 
     # What is not there makes it no more suspicious.
-    snapshot = Catalog(report.out).current()
+    snapshot = read_snapshot(report.out)
     for part in ("normal_angle", "surface_distance", "normal_sum"):
-        assert np.isfinite(snapshot.value(part, row))
+        assert np.isfinite(snapshot.table[part][row])

@@ -6,40 +6,59 @@ import base64
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 from starlette.testclient import TestClient
 
-from drakegrasp.page.catalog import Snapshot
+from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.catalog import IDENTITY, Snapshot
 
 #: A name that must stay text.
 ATTACK = "<script>alert(1)</script>"
 
 
 def state_of(client: TestClient) -> Snapshot:
-    """The state of the files that an application shows."""
-    found: Snapshot = client.app.state.inspection.catalog.current()  # type: ignore[attr-defined]
+    """The dataset that an application shows."""
+    found: Snapshot = client.app.state.inspection.snapshot  # type: ignore[attr-defined]
     return found
 
 
 def coded(snapshot: Snapshot, text: str) -> str:
-    """Return an address or a label with the codes of objects where it has their numbers.
+    """Return an address or a label with rows of attempts for object, palm pose and stand-off.
 
     `/grasp/0-3-2` is the page of object 0, palm pose 3, stand-off 2.
     """
 
-    def code(found: re.Match[str]) -> str:
-        number = int(found[1])
-        return snapshot.codes[number] if number < len(snapshot.codes) else found[0]
+    def row(found: re.Match[str]) -> str:
+        identities = np.column_stack([snapshot.table[name] for name in IDENTITY])
+        (rows,) = np.nonzero((identities == [int(n) for n in found[0].split("-")]).all(axis=1))
+        return str(rows[0]) if len(rows) else "999999"
 
-    return re.sub(r"\b(\d+)(?=-\d+-\d)", code, text)
+    return re.sub(r"\b\d+-\d+-\d+\b", row, text)
+
+
+def numbered(snapshot: Snapshot, text: str) -> str:
+    """Return a label, or the address of an attempt's page, as `coded` was given it."""
+
+    def label(found: re.Match[str]) -> str:
+        i = int(found[0])
+        key = snapshot.key(i)
+        return f"{snapshot.table.object[i]}-{key.candidate}-{key.standoff_index}"
+
+    return re.sub(r"^\d+$|(?<=^/grasp/)\d+", label, text)
 
 
 def get(client: TestClient, address: str) -> Any:
-    """Return the answer to an address with numbers for the codes of objects, see `coded`."""
+    """Return the answer to an address, see `coded`."""
     return client.get(coded(state_of(client), address))
+
+
+def open_pages(out: Path) -> TestClient:
+    """Return the application that shows a dataset as it is now."""
+    return TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1:8321")
 
 
 def surface_of(content: bytes | str) -> trimesh.Trimesh:
@@ -51,13 +70,6 @@ def surface_of(content: bytes | str) -> trimesh.Trimesh:
         faces = np.frombuffer(base64.b64decode(part["faces"]), dtype="<u4").reshape(-1, 3)
         parts.append(trimesh.Trimesh(vertices, faces, process=False))
     return trimesh.util.concatenate(parts)
-
-
-def numbered(snapshot: Snapshot, text: str) -> str:
-    """Return a text with the numbers of objects for their codes: what `coded` was given."""
-    for number, code in enumerate(snapshot.codes):
-        text = text.replace(code, str(number))
-    return text
 
 
 class Tags(HTMLParser):

@@ -1,17 +1,14 @@
 """The pages in a real browser: Chromium of the system, driven by Playwright.
 
-They skip where there is no Chromium; `make test-browser` installs it on Debian. Screenshots are
-written to the folder that DRAKEGRASP_SCREENSHOTS names, if it is set.
+They skip where there is no Chromium; `make test-browser` installs it on Debian.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 
@@ -35,7 +32,7 @@ from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.filters import Removal
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.page.catalog import Catalog, Snapshot
+from drakegrasp.page.catalog import Snapshot, read_snapshot
 from drakegrasp.page.serve import listen
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -89,7 +86,7 @@ def _is_ours(url: str) -> bool:
 @pytest.fixture
 def state(boxes: Path) -> Snapshot:
     """Of the dataset that is shown: objects have codes in addresses."""
-    return Catalog(boxes).current()
+    return read_snapshot(boxes)
 
 
 @pytest.fixture
@@ -119,13 +116,6 @@ def colours_of(page: Page) -> int:
     png = page.locator("#view3d").screenshot()
     pixels = (imread(BytesIO(png))[..., :3] * 15.0).astype(int).reshape(-1, 3)
     return len(np.unique(pixels, axis=0))
-
-
-def keep_screenshot(page: Page, name: str) -> None:
-    folder = os.environ.get("DRAKEGRASP_SCREENSHOTS")
-    if folder:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        page.screenshot(path=str(Path(folder) / f"{name}.png"), full_page="narrow" in name)
 
 
 def labels(page: Page, state: Snapshot) -> list[str]:
@@ -205,7 +195,6 @@ def test_pages_fit_and_their_pictures_load(
             wait_for_view(page)
         page.wait_for_load_state("networkidle")
         assert page.evaluate("document.documentElement.scrollWidth") <= width, name
-        keep_screenshot(page, f"{name}_{size}")
 
 
 def test_3d_view_draws_each_state(page: Page, address: str, state: Snapshot) -> None:
@@ -247,20 +236,18 @@ def test_keys_move_the_3d_view(page: Page, address: str, state: Snapshot) -> Non
     page.wait_for_url(coded(state, "**/grasp/*"))
 
 
-def test_keyboard_moves_rejects_keeps_and_undoes(
+def test_keyboard_moves_rejects_and_undoes(
     page: Page, address: str, state: Snapshot, out: Path
 ) -> None:
-    keys = [AttemptKey("1_box_a", *numbers) for numbers in ((0, 0), (1, 0), (3, 2))]
+    key = AttemptKey("1_box_a", 0, 0)
     page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
     page.keyboard.press("r")  # rejects, and goes on to the next
     page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
-    wait_for_decision(out, keys[0], "rejected")
-    page.keyboard.press("k")
+    wait_for_decision(out, key, "rejected")
+    page.keyboard.press("n")
     page.wait_for_url(coded(state, "**/grasp/0-3-2?sort=row&order=up"))
-    wait_for_decision(out, keys[1], "kept")
     page.keyboard.press("ArrowLeft")
     page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
-    assert page.inner_text("#decision") == "kept"
     page.keyboard.press("p")
     page.wait_for_url(coded(state, "**/grasp/0-0-0?sort=row&order=up"))
     assert page.inner_text("#decision") == "rejected"
@@ -269,49 +256,27 @@ def test_keyboard_moves_rejects_keeps_and_undoes(
 
     # Undo shows what was undone.
     page.keyboard.press("u")
-    wait_for_decision(out, keys[1], "")
-    # The page takes one request at a time: a key before the answer would be lost.
+    wait_for_decision(out, key, "")
+    page.wait_for_url(coded(state, "**/grasp/0-0-0?sort=row&order=up"))
     page.wait_for_selector("#decision", state="hidden")
     page.keyboard.press("u")
     page.wait_for_selector("#message:has-text('Nothing to undo.')")
-    assert read_decisions(out / "reject.json").of(keys[0]) == "rejected"
     page.keyboard.press("g")
     page.wait_for_selector("#cards")
 
 
-@pytest.mark.parametrize("first", ["[data-layer=forces]", "[data-record]", ""])
+@pytest.mark.parametrize("first", ["[data-layer=forces]", ""])
 def test_keys_work_whatever_was_done_before(
     page: Page, address: str, state: Snapshot, out: Path, first: str
 ) -> None:
-    """After a click on a checkbox, while a recording is made, and with Caps Lock."""
-    page.route("**/record", lambda route: None)  # an answer that never comes
+    """After a click on a checkbox, and with Caps Lock."""
     page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
     wait_for_view(page)
     if first:
         page.click(first)
-    page.keyboard.press("k" if first else "K")
+    page.keyboard.press("r" if first else "R")
     page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
-    wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "kept")
-    page.unroute("**/record")
-
-
-def _fulfil(body: str, route: playwright.Route) -> None:
-    route.fulfill(body=body)
-
-
-def test_a_recording_says_how_it_compares(page: Page, address: str, state: Snapshot) -> None:
-    answers = [
-        '{"url": "/", "same": true, "text": "trial 0 of <b>: was success, is success"}',
-        '{"url": "/", "same": false, "text": "slip differs: by up to 0.001"}',
-    ]
-    for answer, words in zip(answers, ("Equal to what is stored.", "Differs from"), strict=True):
-        page.route("**/record", partial(_fulfil, answer))
-        page.goto(coded(state, f"{address}/grasp/0-0-0"))
-        page.click("[data-record]")
-        page.wait_for_selector("#verdict:not([hidden])")
-        assert words in page.inner_text("#verdict")
-        keep_screenshot(page, "verdict_wide")
-        page.unroute("**/record")
+    wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "rejected")
 
 
 def test_the_gallery_counts_undoes_and_says_what_to_do_next(
@@ -323,10 +288,8 @@ def test_the_gallery_counts_undoes_and_says_what_to_do_next(
     page.wait_for_selector("#nextstep:not([hidden])")
     assert "1 rejected, 1 of them samples now" in page.inner_text("#nextstep")
     assert "drakegrasp assemble" in page.inner_text("#nextstep")
-    keep_screenshot(page, "next_wide")
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    keep_screenshot(page, "next_narrow")
     page.click("[data-undo]")
     page.wait_for_selector("#nextstep", state="hidden")
     assert page.inner_text("#message") == "Undone: 2_box_b, palm pose 1, stand-off 0"
@@ -363,7 +326,7 @@ def test_a_server_that_has_ended_is_named(browser: Browser, out: Path, state: Sn
 
 
 def test_a_name_that_is_a_script_stays_text(page: Page, hostile: Path) -> None:
-    state = Catalog(hostile).current()
+    state = read_snapshot(hostile)
     for address in serve(hostile):
         page.goto(address)
         assert page.locator("#cards h2", has_text=ATTACK).count() == 3
@@ -408,10 +371,7 @@ def test_text_stands_out_in_both_themes(
     page: Page, out: Path, tmp_path: Path, state: Snapshot
 ) -> None:
     results = write_predictions(out, tmp_path / "run.h5")
-    decisions = Decisions(
-        rejected=frozenset([AttemptKey("1_box_a", 0, 0)]),
-        kept=frozenset([AttemptKey("2_box_b", 1, 0)]),
-    )
+    decisions = Decisions(rejected=frozenset([AttemptKey("1_box_a", 0, 0)]))
     write_decisions(out / "reject.json", decisions)
     for address in serve(out, results):
         for path in ("/", "/grasp/0-0-0", "/predictions", "/prediction/0"):
@@ -470,18 +430,16 @@ def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> N
 def test_scenes_filter_and_open(page: Page, out: Path) -> None:
     make_scenes(out, overrides=["scenes.views=3"])
     for address in serve(out):
-        for name, (width, height) in SIZES.items():
+        for width, height in SIZES.values():
             page.set_viewport_size({"width": width, "height": height})
             page.goto(address)
             page.click("text=Scenes")
             page.wait_for_load_state("networkidle")
             assert page.evaluate("document.documentElement.scrollWidth") <= width
-            keep_screenshot(page, f"scenes_{name}")
             page.click("#cards li:nth-child(2) a")
             wait_for_view(page)
             assert page.evaluate("document.documentElement.scrollWidth") <= width
             assert "2 of 3" in page.inner_text(".position")
-            keep_screenshot(page, f"scene_{name}")
         assert page.get_attribute("#view3d", "data-ready") == "yes"
         # Palms, hands and the hand of another grasp are all drawn.
         shots = {page.locator("#view3d").screenshot()}

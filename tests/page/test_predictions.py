@@ -185,19 +185,16 @@ def test_a_field_that_a_file_lacks_is_a_dash(out: Path, results: Path) -> None:
     assert client.get("/prediction/0").text.count("<td>–</td>") > 10
 
 
-def test_results_are_read_again_when_they_change(
-    client: TestClient, out: Path, results: Path
+@pytest.mark.parametrize("name", ["results", "out/trials.hdf5"])
+def test_pages_of_replaced_files_are_refused(
+    client: TestClient, out: Path, results: Path, name: str
 ) -> None:
-    assert shown(client, "outcome=dropped") == ["3"]
-    results.unlink()
-    write_predictions(out, results)
-    with h5py.File(results, "r+") as file:
-        file["grasps/outcome"][3] = file["grasps/outcome"][0]
-    assert shown(client, "outcome=dropped") == []
-    # A dataset that has other rows by now is another one.
-    with h5py.File(out / TRIALS, "r+") as file:
-        file.attrs["shards"] = "other"
-    assert client.get("/predictions").status_code == 400
+    with h5py.File(results if name == "results" else out / TRIALS, "r+") as file:
+        file.attrs["other"] = 1
+    for path in ("/predictions", "/", "/strip/0-oto.png"):
+        answer = client.get(path)
+        assert answer.status_code == 400
+        assert "must stay while it is shown, got another; run inspect again" in answer.text
 
 
 def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> None:

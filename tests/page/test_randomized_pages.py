@@ -15,7 +15,7 @@ from drakegrasp.dataset.quality import GRAVITY
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.page.catalog import Catalog
+from drakegrasp.page.catalog import read_snapshot
 from drakegrasp.page.looks import THUMBNAIL, contact_dots, read_rows
 from drakegrasp.vision.camera import intrinsics, project
 
@@ -41,9 +41,9 @@ def imbalance(out: Path) -> np.ndarray:
 
 
 def test_suspicion_is_of_the_drawn_mass(drawn: Path) -> None:
-    snapshot, expected = Catalog(drawn).current(), imbalance(drawn)
+    snapshot, expected = read_snapshot(drawn), imbalance(drawn)
     for i in (0, 3, 11):
-        assert snapshot.value("imbalance", i) == pytest.approx(expected[i], rel=1e-6)
+        assert snapshot.table.imbalance[i] == pytest.approx(expected[i], rel=1e-6)
 
 
 def test_the_filters_of_suspicion_are_of_the_drawn_mass(drawn: Path, tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_page_of_an_attempt_tells_its_own_mass(drawn: Path) -> None:
 
 @pytest.mark.parametrize("camera", ["oto", "otm"])
 def test_dots_are_where_the_moved_camera_sees_the_contacts(drawn: Path, camera: str) -> None:
-    snapshot = Catalog(drawn).current()
+    snapshot = read_snapshot(drawn)
     data = GraspDataset(drawn / f"grasping_{camera}.hdf5", split="test")
     trial = int(data.column("trial_id")[0])
     (row,) = read_rows(snapshot, [trial], THUMBNAIL)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import os
 import re
@@ -10,18 +9,14 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import urllib.request
 from pathlib import Path
-from typing import Any
 
 import pytest
-import uvicorn
 from click.testing import CliRunner
 from helpers.datasets import TRIALS
 
 from drakegrasp.cli.main import main
-from drakegrasp.page import serve as serving
 from drakegrasp.page.app import ASSETS
 from drakegrasp.page.serve import LOOPBACK, listen
 
@@ -36,42 +31,6 @@ CODE = (
 def test_only_the_loopback_address_is_listened_on() -> None:
     with listen(0) as listener:
         assert listener.getsockname()[0] == LOOPBACK == "127.0.0.1"
-
-
-async def slow_app(scope: Any, receive: Any, send: Any) -> None:
-    """Answer a request a moment after its end."""
-    if scope["type"] == "http":
-        while (await receive()).get("more_body"):
-            pass
-        await asyncio.sleep(0.4)
-        headers = [(b"content-length", b"2")]
-        await send({"type": "http.response.start", "status": 200, "headers": headers})
-        await send({"type": "http.response.body", "body": b"ok"})
-
-
-def test_request_that_does_not_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "REQUEST_SECONDS", 0.2)
-    config = serving.server_config(slow_app)
-    config.lifespan = "off"
-    server, listener = uvicorn.Server(config), listen(0)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    head, host = b"POST / HTTP/1.1\r\n", b"Host: x\r\nContent-Length: 4\r\n\r\n"
-    try:
-        for begun in (b"", head, head + host + b"abc"):
-            with socket.create_connection(listener.getsockname(), timeout=60) as client:
-                client.sendall(begun)
-                assert client.recv(100) == b""
-
-        # A complete one is answered, however long that takes; what follows it must end, too.
-        with socket.create_connection(listener.getsockname(), timeout=60) as client:
-            client.sendall(head + host + b"abcd" + head)
-            received = b"".join(iter(lambda: client.recv(1000), b""))
-            assert received.startswith(b"HTTP/1.1 200") and received.endswith(b"ok")
-    finally:
-        server.should_exit = True
-        thread.join(60)
-        listener.close()
 
 
 def test_a_taken_port_is_one_line(boxes: Path) -> None:
@@ -103,7 +62,7 @@ def test_a_build_that_has_not_ended_is_one_line_that_says_how_to_end_it(out: Pat
     )
 
 
-@pytest.mark.parametrize("library", ["starlette", "uvicorn", "jinja2", "h11"])
+@pytest.mark.parametrize("library", ["starlette", "uvicorn", "jinja2"])
 def test_missing_extra_is_one_line(
     library: str, boxes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,18 +9,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.golden import Golden, drawn, points
-from helpers.machine import needs_egl
 from matplotlib.figure import Figure
 from pydrake.geometry import Cylinder, Role
 
 from drakegrasp.config import CameraConfig
-from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures import figures, rendered
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
-from drakegrasp.pictures.rendered import frustum, object_sheet, picture_hand
+from drakegrasp.pictures.rendered import object_sheet, picture_hand
 from drakegrasp.pictures.still_scene import StillScene, camera_pose
 from drakegrasp.vision.camera import Picture
 
@@ -36,17 +35,15 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
     monkeypatch.setattr(figures, "png_bytes", keep)
     monkeypatch.setattr(figures, "svg_bytes", lambda *_, **__: b"")
-    monkeypatch.setattr(rendered, "PIXELS", 64)
     return found
 
 
-@needs_egl
 def test_figures_of_a_dataset(
     sound: Path, tmp_path: Path, pages: list[Figure], golden: Golden
 ) -> None:
     written = write_figures(sound, tmp_path)
     for name, figure in zip(written.names, pages, strict=True):
-        golden(f"figures/{name}", drawn(figure, pixels=name != "phases"))
+        golden(f"figures/{name}", drawn(figure))
     golden("figures/numbers", (tmp_path / NUMBERS_FILE).read_text(encoding="utf-8"))
 
 
@@ -120,19 +117,6 @@ def test_camera_of_a_still_scene() -> None:
     np.testing.assert_allclose(X_WC[:3, 3], [0.2, 0.2, 0.3] + distance * back, atol=1e-12)
     np.testing.assert_allclose(X_WC[:3, :3].T, [[-1, 0, 0], [0, 0.5, -(0.75**0.5)], -back],
                                atol=1e-12)  # fmt: skip
-
-
-def test_field_of_view_is_drawn_to_its_depth() -> None:
-    """The corners are those of the outer pixels, and each has a line from the camera."""
-    K = np.array([[2.0, 0.0, 1.5], [0.0, 2.0, 1.5], [0.0, 0.0, 1.0]])
-    X_WC = make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2.0), [1.0, 2.0, 3.0])
-    frame, *rays = frustum(X_WC, K, 4, 0.5)
-    # Two pixels beside the middle are (2 / f) * depth = 0.5 m, turned by 90 degrees.
-    corners = np.array([[1.5, 1.5], [1.5, 2.5], [0.5, 2.5], [0.5, 1.5], [1.5, 1.5]])
-    np.testing.assert_allclose(frame, np.column_stack([corners, np.full(5, 3.5)]), atol=1e-12)
-    for corner, ray in zip(frame, rays, strict=False):
-        np.testing.assert_allclose(ray, [[1.0, 2.0, 3.0], corner], atol=1e-12)
-    assert len(rays) == 4
 
 
 def test_pads_are_drawn_on_both_sides_and_face_out() -> None:

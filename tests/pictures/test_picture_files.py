@@ -13,21 +13,18 @@ import numpy as np
 import pytest
 from helpers import datasets
 from helpers.datasets import OTO, SLIP, TRIALS, edit_file, make_dataset
-from helpers.machine import needs_egl
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures import figures
 from drakegrasp.pictures.approaches import read_approaches
 from drakegrasp.pictures.figures import NUMBERS_FILE, read_samples, write_figures
 
 ALL = {
-    *("phases", "classes_1", "sheet", "outcomes", "hold", "objects"),
-    *("distributions", "approaches"),
+    *("sheet", "outcomes", "hold", "objects", "distributions", "approaches"),
 }
 
 
@@ -45,19 +42,7 @@ def lose_all(out: Path) -> None:
     edit_file(out / TRIALS, lose)
 
 
-@pytest.fixture
-def no_render(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the only figure that needs a renderer."""
-
-    def refuse(*_: object) -> None:
-        raise DataError("not in this test")
-
-    monkeypatch.setattr(figures, "_phases", refuse)
-
-
-@pytest.mark.sim
 @pytest.mark.nightly
-@needs_egl
 def test_the_same_dataset_gives_the_same_bytes(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,7 +58,6 @@ def test_the_same_dataset_gives_the_same_bytes(
     numbers = json.loads(files[NUMBERS_FILE])
     assert numbers["outcomes"]["samples"] == 9
     assert numbers["hold"]["samples"] == numbers["hold"]["stable"] == 9
-    assert numbers["phases"]["trial_id"] == 0
 
     # The style of somebody's papers changes nothing.
     with mpl.rc_context({"font.size": 25, "axes.grid": True, "savefig.dpi": 30}):
@@ -82,30 +66,28 @@ def test_the_same_dataset_gives_the_same_bytes(
     assert {name for name in files if files[name] != again[name]} == set()
 
 
-@pytest.mark.usefixtures("no_render")
 def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(sound, tmp_path / "out"))
     (out / OTO).unlink()
     lose_all(out)
     folder = tmp_path / "figures"
     folder.mkdir()
-    for name in ("approaches.png", "classes_1.png", "classes_12.svg", "mine.png"):
+    for name in ("approaches.png", "sheet.svg", "mine.png"):
         (folder / name).touch()
     written = write_figures(out, folder)
     assert set(written.names) == {"outcomes", "hold", "objects"}
     assert written.left_out["approaches"] == "no attempt became a sample"
     assert written.left_out["distributions"] == "no attempt became a sample"
-    assert OTO in written.left_out["classes"] and OTO in written.left_out["sheet"]
+    assert OTO in written.left_out["sheet"]
     # A picture of what was there before is removed, and nothing else.
     assert {p.name for p in folder.glob("*.png")} == {
         *(f"{name}.png" for name in written.names),
         "mine.png",
     }
-    assert not list(folder.glob("classes_*.svg"))
+    assert not (folder / "sheet.svg").exists()
     assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["samples"] == 0
 
 
-@pytest.mark.usefixtures("no_render")
 def test_pictures_of_samples_count_the_same_rows(sound: Path, tmp_path: Path) -> None:
     """Two of the nine successes are removed; each picture tells of the seven samples."""
     out = Path(shutil.copytree(sound, tmp_path / "out"))
@@ -121,33 +103,16 @@ def test_pictures_of_samples_count_the_same_rows(sound: Path, tmp_path: Path) ->
     assert sorted(numbers["sheet"]["trial_ids"]) == [3, 11, 15, 23, 24, 27, 35]
 
 
-def test_names_are_drawn_as_they_are_also_without_opengl(
-    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_are_drawn_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one object, whose name would be a formula, a tag, and letters that the font lacks."""
-
-    def fail(*_: object) -> None:
-        raise MachineError("no EGL")
-
-    monkeypatch.setattr(figures, "phases_figure", fail)
     name = "1_$^$ <script>&\"' 碗 x" + 30 * "y"
     monkeypatch.setattr(datasets, "BOXES", {name: ((0.06, 0.05, 0.10), "a $^$ class")})
     out = make_dataset(tmp_path / "out", tmp_path)
     written = write_figures(out, tmp_path / "figures")
-    assert set(written.names) == ALL - {"phases"}
-    assert written.left_out == {"phases": "no EGL"}
+    assert set(written.names) == ALL
     for svg in (tmp_path / "figures").glob("*.svg"):
         assert b"<script" not in svg.read_bytes()
     assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
-    with pytest.raises(MachineError, match="no EGL"):
-        write_figures(sound, tmp_path / "asked", trial_id=0)
-
-
-def test_what_was_asked_for_must_be_drawn(sound: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="trial must be 0 to 35, got 36"):
-        write_figures(sound, tmp_path, trial_id=36)
-    with pytest.raises(DataError, match="must have been lifted, got below_table"):
-        write_figures(sound, tmp_path, trial_id=2)
 
 
 def test_every_sample_is_read_once(sound: Path) -> None:

@@ -10,25 +10,22 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from doc_figures import find_sample, frames_figure, hero_figure
-from helpers.datasets import MISSING, OTO
 from helpers.machine import needs_egl
-from helpers.scripts import PIPELINES
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import create_field
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.pictures import sheets
 from drakegrasp.pictures.sheets import (
-    class_sheets,
     draw_sheet,
     sample_sheet,
     scene_views,
@@ -134,14 +131,6 @@ def test_samples_are_spread_over_objects() -> None:
     assert spread_over_objects([f"{i}_x" for i in range(9)], 3) == [0, 4, 8]
 
 
-def test_sample_of_an_unknown_trial_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "grasping_oto.hdf5"
-    write_data_file(path, ["1_mug", "2_box"])
-    assert find_sample(path, 11)[0].props["object_name"] == "2_box"
-    with pytest.raises(DataError, match="trial 12"):
-        find_sample(path, 12)
-
-
 def test_examples_of_the_docs_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,84 +152,41 @@ def test_examples_of_the_docs_run(
 
 @pytest.mark.sim
 @needs_egl
-def test_snapshots_show_the_hand_and_the_object(sound: Path, tmp_path: Path) -> None:
-    from trial_pictures import render_trial
-
-    pictures = render_trial(sound, 0, size=(160, 120))
-    assert [p.image.shape for p in pictures] == [(120, 160, 3)] * 3
-    for picture in pictures:
-        assert picture.image.std() > 5.0
-    # The open and the closed hand are seen from one point, the lifted one from another.
-    np.testing.assert_array_equal(pictures[0].X_WC, pictures[1].X_WC)
-    assert np.abs(pictures[0].image.astype(int) - pictures[1].image).max() > 50
-    assert pictures[2].X_WC[2, 3] > pictures[1].X_WC[2, 3]
-    files = [sound / f"grasping_{camera}.hdf5" for camera in ("oto", "otm")]
-    hero_figure(*files, 0, pictures, tmp_path / "hero.png")
-    assert imread(tmp_path / "hero.png").shape[1] > 1000
-
-
-@pytest.mark.sim
-@needs_egl
-def test_figure_of_the_frames_has_them_all(sound: Path, tmp_path: Path) -> None:
-    from trial_pictures import frames_panels
-
-    panels = frames_panels(sound, 0)
-    names = [name for p in panels for name in (*(t.label for t in p.triads), *p.points, *p.arrows)]
-    letters = ["W", "T", "O", "Ocm", "G", "F1", "F2", "F3", "Q1", "Q2", "Q3", "C", "I"]
-    assert set(names) == set(letters)
-    # Every frame's origin is in its picture.
-    for panel in panels:
-        height, width = panel.picture.image.shape[:2]
-        for triad in panel.triads:
-            uv = panel.picture.pixels(triad.X_WA[None, :3, 3])[0]
-            assert np.all((uv >= 0.0) & (uv <= [width, height])), triad.label
-    frames_figure(panels, tmp_path / "frames.png")
-    assert imread(tmp_path / "frames.png").shape[1] > 1000
-
-
-@pytest.mark.sim
-@needs_egl
 def test_chosen_view_sees_every_fingertip(sound: Path) -> None:
-    from drakegrasp.frames import X_WT
+    from drakegrasp.frames import X_WT, unpack_pose
     from drakegrasp.hand.description import load_hand
-    from drakegrasp.pictures.rendered import load_trial
+    from drakegrasp.objects.model import load_object
+    from drakegrasp.pictures.still_scene import Poses, StillScene
     from drakegrasp.simulation.construction import build_scene
     from drakegrasp.simulation.scene import hand_joint_names
 
-    trial = load_trial(sound, 0)
-    scene = build_scene(trial.model, trial.config.physics, load_hand(trial.config.hand))
+    row, hand = Trials(sound).trial(0), load_hand()
+    model = load_object(sound / "objects" / f"{row['object_name']}.npz")
+    scene = StillScene(hand, model)
     # What trials.hdf5 holds is in the order of the simulated scene.
-    assert list(trial.scene.joints) == list(hand_joint_names(scene))
-    assert trial.place.q.tolist().count(0.1) == 2
-    body = trial.scene.outline(trial.close)
-    X_WC = trial.scene.choose_view(body)
-    *tips, box = trial.scene.seen(X_WC, (128, 128))
+    built = build_scene(model, read_manifest(sound).config.physics, hand)
+    assert list(scene.joints) == list(hand_joint_names(built))
+    X_WO = X_WT @ unpack_pose(row["X_TO"])
+    closed = Poses(X_WG=X_WO @ unpack_pose(row["X_OG"]), q=row["closed_q"], X_WO=X_WO)
+    body = scene.outline(closed)
+    X_WC = scene.choose_view(body)
+    *tips, box = scene.seen(X_WC, (128, 128))
     assert [tip.sum() > 30 for tip in tips] == [True] * 3
     # What is shown is in the picture, and the object where its frame projects to.
-    picture = trial.scene.picture(X_WC, (128, 128))
+    picture = scene.picture(X_WC, (128, 128))
     uv = picture.pixels(body)
     assert np.all((uv >= 0.0) & (uv <= 127.0))
     rows, columns = np.nonzero(box)
-    top = trial.close.X_WO[:3, 3] + [0.0, 0.0, trial.model.half_extents[2]]
+    top = X_WO[:3, 3] + [0.0, 0.0, model.half_extents[2]]
     assert abs(picture.pixels(top[None])[0, 1] - rows.min()) < 6.0
     assert abs(picture.pixels(X_WT[None, :3, 3])[0, 0] - columns.mean()) < 6.0
-
-
-@pytest.mark.sim
-def test_only_lifted_trials_can_be_shown(sound: Path) -> None:
-    from drakegrasp.pictures.rendered import load_trial
-
-    with pytest.raises(DataError, match="missing_fingertip"):
-        load_trial(sound, MISSING)
-    with pytest.raises(DataError, match="0 to 35"):
-        load_trial(sound, 36)
 
 
 def test_figures_import_no_drake() -> None:
     import subprocess
 
     code = (
-        "import sys, doc_figures, drakegrasp.pictures.sheets; "
+        "import sys, drakegrasp.pictures.sheets; "
         "print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
     )
     found = subprocess.run(
@@ -248,7 +194,6 @@ def test_figures_import_no_drake() -> None:
         capture_output=True,
         text=True,
         check=True,
-        cwd=PIPELINES / "docs",
     )
     assert found.stdout.strip() == "set()"
 
@@ -266,27 +211,6 @@ def test_a_finger_that_a_grasp_leaves_out_is_not_drawn() -> None:
     draw_contacts(axes, sample, np.diag([20.0, 20.0, 1.0]))
     assert {line.get_gid() for line in axes.lines} - {None} >= {"contact 0", "contact 2"}
     assert "contact 1" not in {line.get_gid() for line in axes.lines}
-
-
-def titles(pages: list) -> list[str]:
-    return [text.get_text() for page in pages for axes in page.axes for text in axes.texts]
-
-
-def test_each_class_has_its_first_sample(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pages, trials = class_sheets(sound / OTO)
-    first: dict[str, int] = {}
-    with h5py.File(sound / OTO, "r") as file:
-        for split in SPLITS:
-            group = file[split]
-            names = group["object_props/class_name"].asstr()[:]
-            for name, trial in zip(names, group["trial_id"][:], strict=True):
-                first[name] = min(int(trial), first.get(name, 10**6))
-    assert trials == first
-    assert list(trials) == ["box", "brick"]
-    assert titles(pages) == ["box", f"trial {first['box']}", "brick", f"trial {first['brick']}"]
-    # Many classes fill pages.
-    monkeypatch.setattr(sheets, "PER_PAGE", 1)
-    assert (len(pages), len(class_sheets(sound / OTO)[0])) == (1, 2)
 
 
 @pytest.mark.sim
@@ -312,6 +236,6 @@ def test_each_view_shows_the_contacts_of_a_sample_of_its_scene(out: Path) -> Non
 
 
 def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
-    for draw, line in ((class_sheets, "a data file"), (scene_views, "the scenes of a dataset")):
+    for draw, line in ((sample_sheet, "a data file"), (scene_views, "the scenes of a dataset")):
         with pytest.raises(DataError, match=rf"missing\.hdf5: must be {line}"):
             draw(tmp_path / "missing.hdf5")

@@ -17,13 +17,13 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, joint_positions
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.attempts import make_posture
 from drakegrasp.simulation.drive import disengage, engage
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import (
     OPENED,
     Posture,
     joint_order,
-    make_posture,
     opened,
     run_trial,
     start_of,
@@ -72,15 +72,15 @@ def test_joints_in_another_order_are_told_by_their_names():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"q_grasp": np.zeros(7)}, r"q_grasp must be 8 finite .*shape \(7,\)"),
-        ({"q_grasp": np.full(8, np.nan)}, "q_grasp must be 8 finite joint positions"),
-        ({"q_squeeze": ["a"] * 8}, "q_squeeze must be 8 joint positions, got text"),
+        ({"q_grasp": np.zeros(7)}, r"grasp joints must be of shape \(1, 8\), got \(1, 7\)"),
+        ({"q_grasp": np.full(8, np.nan)}, "q_grasp must be finite numbers"),
+        ({"q_squeeze": ["a"] * 8}, "squeeze joints must be numbers .*, got text"),
         ({"X_FG": np.zeros((4, 4))}, "the palm's pose must have 0 0 0 1"),
-        ({"frame": "mesh"}, "frame must be one of object, table, camera, world, got 'mesh'"),
+        ({"frame": "mesh"}, "X_OM must be given for the frame mesh"),
         ({"frame": "table"}, "X_TO must be given with the frame table, got None"),
         ({"frame": "camera", "X_TO": X}, "X_TC must be given with the frame camera"),
         ({"X_TC": X}, "X_TC must be given with the frame camera, and only then"),
-        ({"joints": ["finger1_spread_joint"] * 8}, "joints must name each joint of the hand once"),
+        ({"joints": ["finger1_spread_joint"] * 8}, "joints must be named once each"),
     ],
 )
 def test_what_is_no_posture_is_refused_in_a_line(options, words):

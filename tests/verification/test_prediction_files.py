@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.contacts import read_contacts, read_numbers
+from drakegrasp.exchange.columns import read_numbers
+from drakegrasp.exchange.contacts import read_contacts
 
 NUMBERS = np.random.default_rng(0).normal(size=(4, 18)).round(6)
 
@@ -156,7 +157,7 @@ def _absurd(path):
     [
         (_missing, r"grasps\.npy: must be a file of grasps, got none"),
         (_folder, r"grasps\.h5: must be a file of grasps, got none"),
-        (_other_suffix, r"must be a file \.npy, \.csv, \.h5, \.hdf5 or \.parquet, got '\.txt'"),
+        (_other_suffix, r"must be a file \.npy, \.h5, \.hdf5, \.csv or \.parquet, got '\.txt'"),
         (_of("a.npy", b""), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_of("a.npy", b"PK\x03\x04 zip"), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_cut_off, "must be a .npy file of numbers, got none"),
@@ -168,14 +169,14 @@ def _absurd(path):
         (_array(np.zeros((2, 3, 6))), r"or one grasp, got an array of shape \(2, 3, 6\)"),
         (_array(1.0), r"or one grasp, got an array of shape \(\)"),
         (_array(np.zeros((0, 18))), "must hold at least one grasp, got none"),
-        (_of("a.csv", b"1,2\n1,two\n"), "line 2: must be numbers .*, got 'two' as number 2"),
-        (_of("a.csv", b"1,two\n1,2\n"), "line 1: must be numbers .*, got 'two' as number 2"),
-        (_of("a.csv", b"\n1;2\n3;4\n"), "line 2: must be numbers .*, got '1;2' as number 1"),
-        (_of("a.csv", b"a,b\n1,2\n1,2,3\n"), "line 3: must have 2 numbers like line 2, got 3"),
-        (_of("a.csv", b"1,2,\n"), "line 1: must be numbers .*, got '' as number 3"),
+        (_of("a.csv", b"1,2\n1,two\n"), "of equally many numbers, got none .*'two'"),
+        (_of("a.csv", b"1,two\n1,2\n"), "of equally many numbers, got none .*'two'"),
+        (_of("a.csv", b"\n1;2\n3;4\n"), "of equally many numbers, got none .*'1;2'"),
+        (_of("a.csv", b"a,b\n1,2\n1,2,3\n"), "of equally many numbers, got none .*2 to 3"),
+        (_of("a.csv", b"1,2,\n"), "of equally many numbers, got none .*''"),
         (_of("a.csv", b"a,b\n\n"), "must hold at least one grasp, got none"),
-        (_of("a.csv", b"\xff\xfe1\x00"), "must be a text file of numbers, got none"),
-        (_of("a.h5", b"no HDF5"), "must be an HDF5 file with grasps, got none"),
+        (_of("a.csv", b"\xff\xfe1\x00"), "of equally many numbers, got none"),
+        (_of("a.h5", b"no HDF5"), "must be a file of grasps, .* by the name 'grasps', got none"),
         (_tree(images=np.zeros(3)), "must hold an array 'grasps' .*, got none$"),
         (_tree(grasps=["a"]), "/grasps: must hold real numbers"),
         (_tree(grasps=NUMBERS, rows=[0, 1]), r"/rows must hold one whole number for each of the 4"),

@@ -39,7 +39,7 @@
   }
 
   function show(element, decision) {
-    element.classList.remove("rejected", "kept");
+    element.classList.remove("rejected");
     if (decision) element.classList.add(decision);
     element.dataset.decision = decision;
     element.querySelector(".word.decision").textContent = decision;
@@ -47,7 +47,7 @@
 
   // What is decided in all, and what to do next.
   function count(counts) {
-    const numbers = { rejected: counts.rejected, samples: counts.samples, kept: counts.kept };
+    const numbers = { rejected: counts.rejected, samples: counts.samples };
     for (const [id, number] of Object.entries(numbers)) {
       const element = document.getElementById(id);
       if (element) element.textContent = number.toLocaleString("en");
@@ -80,26 +80,6 @@
     });
   }
 
-  // A replay takes seconds: keys work meanwhile.
-  async function record(button) {
-    const link = document.getElementById("recording"), verdict = document.getElementById("verdict");
-    button.disabled = true;
-    button.textContent = "Running…";
-    try {
-      const result = await post("/record", { label: grasp.dataset.label });
-      link.href = result.url;
-      link.hidden = verdict.hidden = false;
-      button.hidden = true;
-      verdict.textContent = `${result.same ? "Equal to what is stored" : "Differs from what is stored"}.\n${result.text}`;
-      verdict.classList.toggle("same", result.same);
-    } catch (error) {
-      say(error.message);
-    } finally {
-      button.disabled = false;
-      button.textContent = "Run again and record";
-    }
-  }
-
   function go(id) {
     const link = document.getElementById(id);
     if (link) link.click();
@@ -112,7 +92,6 @@
     if (button.dataset.decide) decide(element, button.dataset.decide, false);
     else if ("undo" in button.dataset) undo();
     else if ("keys" in button.dataset) list.showModal();
-    else if ("record" in button.dataset) record(button);
   });
 
   const list = document.getElementById("keys");
@@ -125,7 +104,6 @@
       ArrowLeft: () => go("previous"), p: () => go("previous"),
       g: () => go("gallery"), u: () => undo(), "?": () => list.showModal(),
       r: () => decidable && decide(grasp, "rejected", true),
-      k: () => decidable && decide(grasp, "kept", true),
     };
     // With Caps Lock a letter is a capital one.
     const action = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];

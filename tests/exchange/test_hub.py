@@ -1,0 +1,209 @@
+"""A folder for the Hub: `datasets` opens it, and its values are those of dataset and scenes."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from helpers.commands import run
+from PIL import Image
+
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import (
+    DEPTH_UNIT,
+    SCENE_GRASP_FIELDS,
+    SPLITS,
+    VIEW_FIELDS,
+    Field,
+)
+from drakegrasp.errors import DataError, MachineError
+from drakegrasp.exchange import hub
+from drakegrasp.exchange.export import export_dataset
+from drakegrasp.generation.scenes import make_scenes
+
+pq = pytest.importorskip("pyarrow.parquet")
+pytest.importorskip("datasets")
+
+#: What `datasets` says of a folder, in a process of its own: it loads half of the packages of the
+#: environment, whose warnings are not ours.
+LOADER = """
+import json, sys
+import datasets, numpy as np
+folder, cache = sys.argv[1:]
+found = {}
+for config in datasets.get_dataset_config_names(folder):
+    for split, rows in datasets.load_dataset(folder, config, cache_dir=cache).items():
+        streamed = datasets.load_dataset(folder, config, streaming=True)[split]
+        found[f"{config}/{split}"] = {
+            "trial_id": rows["trial_id"][:] if "trial_id" in rows.features else [],
+            "scene": [row["scene"] for row in streamed] if "scene" in rows.features else [],
+            "streamed": [row.get("trial_id") for row in streamed],
+            "pixels": [
+                [np.asarray(row[name]).tolist() for name in ("image", "depth", "mask")]
+                for row in rows
+            ] if config == "oto" else [],
+        }
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(exported: Callable[[str], Path]) -> Path:
+    return exported("hf")
+
+
+@pytest.fixture(scope="module")
+def made(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset with scenes."""
+    out = Path(shutil.copytree(dataset, tmp_path_factory.mktemp("scenes") / "out"))
+    make_scenes(out, overrides=["scenes.views=2", "scenes.width=64", "scenes.height=48"])
+    return out
+
+
+@pytest.fixture(scope="module")
+def with_scenes(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    to = tmp_path_factory.mktemp("hub") / "to"
+    export_dataset(made, to, "hf")
+    return to
+
+
+def table_of(folder: Path, config: str, split: str) -> list[dict[str, Any]]:
+    paths = sorted((folder / config).glob(f"{split}-*.parquet"))
+    return [row for path in paths for row in pq.read_table(path).to_pylist()]
+
+
+def pixels_of(cell: dict[str, Any]) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(cell["bytes"])))
+
+
+@pytest.mark.parametrize("camera", ["oto", "otm"])
+@pytest.mark.parametrize("split", SPLITS)
+def test_rows_are_those_of_the_data_file(
+    dataset: Path, folder: Path, camera: str, split: str
+) -> None:
+    """Contacts, poses, joints, forces and all else that is no image bit for bit."""
+    data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+    rows = table_of(folder, camera, split)
+    assert len(rows) == len(data) > 0
+    assert set(rows[0]) == {*hub.COLUMNS, "image", "depth", "mask"}
+    for name, field in hub.COLUMNS.items():
+        own = data.column(field.name).tolist()
+        np.testing.assert_equal([row[name] for row in rows], own, err_msg=name)
+    for row, sample in zip(rows, data, strict=True):
+        colour = np.moveaxis(pixels_of(row["image"]) / 255.0, -1, 0)
+        assert np.abs(colour - sample.image[:3]).max() <= 0.5 / 255.0 + 1e-6
+        depth = pixels_of(row["depth"]) * DEPTH_UNIT
+        assert np.abs(depth - sample.image[3]).max() <= 0.51 * DEPTH_UNIT
+        assert (pixels_of(row["mask"]) == 255 * sample.mask).all()
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("config", "group", "fields"),
+    [("views", "views", VIEW_FIELDS), ("scene_grasps", "grasps", SCENE_GRASP_FIELDS)],
+)
+def test_rows_of_scenes_are_those_of_their_file(
+    made: Path, with_scenes: Path, config: str, group: str, fields: tuple[Field, ...]
+) -> None:
+    """Images, numbers, and what is said of the scene, in the split of the scene."""
+    with h5py.File(made / "scenes.hdf5") as file:
+        own, scenes, names = file[group], file["scenes"], file["objects/name"].asstr()[:]
+        of_rows = scenes["split"][:][own["scene"][:]]
+        for number, split in enumerate(SPLITS):
+            found = table_of(with_scenes, config, split)
+            places = np.flatnonzero(of_rows == number)
+            assert len(found) == len(places) > 0 or split == "valid"
+            for row, i in zip(found, places, strict=True):
+                scene = row["scene"]
+                assert row["object_name"] == [names[scenes["object"][scene, 0]]]
+                assert row["X_TO"] == scenes["X_TO"][scene].tolist()
+                for field in fields:
+                    if field.name not in own:  # an optional column
+                        continue
+                    value = row["image" if field.name == "rgb" else field.name]
+                    value = pixels_of(value) if field.sample else value
+                    np.testing.assert_array_equal(value, own[field.name][i], err_msg=field.name)
+
+
+@pytest.mark.sim
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_datasets_loads_what_the_files_hold(with_scenes: Path, tmp_path: Path) -> None:
+    process = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", LOADER, str(with_scenes), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PATH": "", "HOME": str(tmp_path), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)},
+    )
+    assert process.returncode == 0, process.stderr
+    found = json.loads(process.stdout.splitlines()[-1])
+    assert {name.partition("/")[0] for name in found} == {"oto", "otm", "views", "scene_grasps"}
+    for name, said in found.items():
+        rows = table_of(with_scenes, *name.split("/"))
+        assert len(said["streamed"]) == len(rows)
+        if "trial_id" in rows[0]:
+            assert said["trial_id"] == said["streamed"] == [row["trial_id"] for row in rows]
+        for pixels, row in zip(said["pixels"], rows, strict=False):
+            for values, image in zip(pixels, ("image", "depth", "mask"), strict=True):
+                np.testing.assert_array_equal(values, pixels_of(row[image]))
+        if "scene" in rows[0]:
+            assert said["scene"] == [row["scene"] for row in rows]
+
+
+def test_card_names_licence_and_files_and_is_that_of_the_dataset(
+    dataset: Path, folder: Path
+) -> None:
+    head, text = (folder / "README.md").read_text(encoding="utf-8").split("---\n")[1:]
+    described = yaml.safe_load(head)
+    assert described["license"] == "cc-by-4.0"
+    assert [config["config_name"] for config in described["configs"]] == ["oto", "otm"]
+    for config in described["configs"]:
+        for entry in config["data_files"]:
+            assert list(folder.glob(entry["path"]))
+    own = (dataset / "DATACARD.md").read_text(encoding="utf-8")
+    assert own[own.index("## How it was made") :] in text
+    assert str(GraspDataset(dataset / "grasping_oto.hdf5").K.tolist()) in text
+    assert "it is 0.75 m" in " ".join(text.split())
+    for absent in ("trials.hdf5", "manifest.json", "grasping_o"):
+        assert absent not in text.partition("## How it was made")[0]
+
+
+def test_long_splits_are_cut_into_files(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hub, "FILE_ROWS", 2)
+    assert run("export", dataset, tmp_path / "to", "--to", "hf").exit_code == 0
+    data = GraspDataset(dataset / "grasping_oto.hdf5", split="test")
+    assert len(list((tmp_path / "to" / "oto").glob("test-*.parquet"))) == -(-len(data) // 2) > 1
+    ids = [row["trial_id"] for row in table_of(tmp_path / "to", "oto", "test")]
+    assert ids == data.column("trial_id").tolist()
+
+
+@pytest.mark.sim
+def test_scenes_of_other_trials_are_refused(made: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(made, tmp_path / "out"))
+    with h5py.File(out / "scenes.hdf5", "r+") as file:
+        file.attrs["shards"] = "others"
+    with pytest.raises(DataError, match="must be of the trials in its folder, got other scenes"):
+        export_dataset(out, tmp_path / "to", "hf")
+    assert not (tmp_path / "to").exists()
+
+
+def test_missing_datasets_is_one_line(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "datasets", None)
+    with pytest.raises(MachineError, match=r"needs datasets, got none: pip install"):
+        export_dataset(dataset, tmp_path / "to", "hf")
+    assert not list(tmp_path.iterdir())
