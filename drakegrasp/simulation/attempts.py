@@ -773,9 +773,6 @@ def given_candidates(
         source=np.full(count, Source.POSTURES, dtype=np.int64),
         spread=np.full(count, np.nan),
         preshape_index=np.full(count, -1),
-        combinations=count,
-        valid=count,
-        distinct=count,
         postures=Table({name: getattr(table, name) for name in _IN_PLAN}),
     )
 

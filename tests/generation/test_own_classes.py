@@ -47,10 +47,10 @@ WRONG_SAMPLERS = {
     "no class but a value": ("Mine = 3", r"mine\.py: must have a class Mine, got none"),
     "constructor": (
         "class Mine:\n  def __init__(self, model): pass\n  def poses(self): yield",
-        r"mine\.py:Mine: must take \(model, X_TO, stream\), got other arguments",
+        r"mine\.py:Mine: must take \(model, X_TO, stream, config\), got other arguments",
     ),
     "no method": (
-        "class Mine:\n  def __init__(self, model, X_TO, stream): pass",
+        "class Mine:\n  def __init__(self, model, X_TO, stream, config): pass",
         r"mine\.py:Mine: must have a method poses\(self\), got none like it",
     ),
 }

@@ -84,7 +84,6 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     round_base = source.name == "2_cylinder"
     yield "X_TO", digest(np.round(prepared.X_TO[2], 4) + 0.0 if round_base else prepared.X_TO)
     yield "palm poses", digest(candidates.X_OG, candidates.distance)
-    yield "counts", f"{candidates.combinations} {candidates.valid} {candidates.distinct}"
     yield (
         "attempts",
         digest(
@@ -126,7 +125,7 @@ def main(meshes: Path | None) -> dict[str, object]:
     half = np.array([0.03, 0.04, 0.05])
     X_TO = np.eye(4)
     X_TO[2, 3] = half[2]
-    poses, *_ = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
+    poses = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
     found["jittered palm poses"] = digest(poses)
     names = [f"{i}_thing" for i in range(12)]
     homes = find_homes(names, {}, SplitConfig(seed=7))

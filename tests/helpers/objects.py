@@ -78,7 +78,7 @@ def write_above(folder: Path, standoff: float, x: float = 0.0) -> str:
         "from drakegrasp.frames import make_pose\n"
         "from drakegrasp.simulation.samplers import R_OG0\n"
         "class Above:\n"
-        "  def __init__(self, model, X_TO, stream):\n"
+        "  def __init__(self, model, X_TO, stream, config):\n"
         f"    self.height = float(model.half_extents[2]) + {standoff}\n"
         "  def poses(self):\n"
         f"    yield make_pose(R_OG0, [{x}, 0.0, self.height])\n"
