@@ -11,7 +11,6 @@ import json
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np

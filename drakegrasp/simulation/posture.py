@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,14 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import X_WT, Array, as_numbers, invert_pose, read_pose
+from drakegrasp.frames import (
+    Array,
+    Frame,
+    as_numbers,
+    frame_in_object,
+    read_pose,
+    refuse_other_frames,
+)
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, open_together
 from drakegrasp.hand.parsing import position_order
@@ -29,9 +35,8 @@ from drakegrasp.simulation.placement import PlacedObject, config_for, refuse_oth
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
-Frame = Literal["object", "table", "camera", "world"]
-FRAMES: tuple[str, ...] = get_args(Frame)
-
+#: Frames in which `make_posture` takes a palm pose.
+FRAMES = (Frame.OBJECT, Frame.TABLE, Frame.CAMERA, Frame.WORLD)
 #: A joint follows the hand file if it is at most this far from where the file has it (coupled
 #: joint) or from another spread joint, in units of its finger's closing joint.
 COUPLED = np.deg2rad(1.0)
@@ -119,8 +124,13 @@ def make_posture(
             raise GraspError(f"{name} must be {size} finite joint positions, got {got}")
         q[name] = vector if order is None else vector[order]
 
-    X_OF = _frame_in_object(frame, X_TO, X_TC)
-    X_OG = multiply(X_OF, exact_pose(X_FG, "the palm's pose"))
+    refuse_other_frames(frame, FRAMES)
+    if (X_TC is None) == (frame == Frame.CAMERA):
+        got = "none" if X_TC is None else f"a pose with frame {frame!r}"
+        raise GraspError(f"X_TC must be given with the frame camera, and only then, got {got}")
+    poses = {"X_TO": X_TO, "X_TC": X_TC}
+    exact = {name: None if X is None else exact_pose(X, name) for name, X in poses.items()}
+    X_OG = multiply(frame_in_object(frame, **exact), exact_pose(X_FG, "the palm's pose"))
     return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"], preshape)
 
 
@@ -136,25 +146,6 @@ def preshape_index(hand: Hand, name: str | None) -> int | None:
         known = f"one of {', '.join(hand.preshape_names)}" if hand.preshapes else "left out"
         raise GraspError(f"preshape must be {known} for the hand {hand.name}, got {name!r}")
     return hand.preshape_names.index(name)
-
-
-def _frame_in_object(frame: str, X_TO: npt.ArrayLike | None, X_TC: npt.ArrayLike | None) -> Array:
-    """Return the pose (4, 4) of a frame in {O}."""
-    if frame not in FRAMES:
-        raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
-    if (X_TC is None) == (frame == "camera"):
-        got = "none" if X_TC is None else f"a pose with frame {frame!r}"
-        raise GraspError(f"X_TC must be given with the frame camera, and only then, got {got}")
-    if frame == "object":
-        return np.eye(4)
-    if X_TO is None:
-        raise GraspError(f"X_TO must be given with the frame {frame}, got None")
-    X_OT = invert_pose(exact_pose(X_TO, "X_TO"))
-    if frame == "table":
-        return X_OT
-    if frame == "world":
-        return multiply(X_OT, invert_pose(X_WT))
-    return multiply(X_OT, exact_pose(X_TC, "X_TC"))  # type: ignore[arg-type]
 
 
 def exact_pose(X: npt.ArrayLike, name: str) -> Array:

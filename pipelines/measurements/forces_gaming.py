@@ -98,7 +98,7 @@ def some_grasps(out: Path, number: int) -> list[Grasp]:
     names = samples.objects["name"][samples["object"]]
     turn = np.array([int((names[:i] == name).sum()) for i, name in enumerate(names)])
     chosen = np.argsort(turn, kind="stable")[:number]
-    contacts = samples.contacts(frame="O")
+    contacts = samples.contacts(frame="object")
 
     config = read_manifest(out).config
     objects = {name: load_prepared(out, name, config) for name in set(names[chosen])}

@@ -122,7 +122,7 @@ def some_grasps(out: Path, number: int) -> Iterator[tuple[GraspDataset, int, int
     The first sample of each object comes first, then the second sample of each.
     """
     trials = Trials(out)
-    contacts = trials.contacts(frame="O")
+    contacts = trials.contacts(frame="object")
     names = trials.objects["name"][trials["object"]]
     found, count = [], dict[str, int]()
     for split in SPLITS:
