@@ -208,13 +208,6 @@ class Drawing:
         )
 
 
-def sample_candidates(
-    model: ObjectModel, X_TO: npt.ArrayLike, config: Config, most: int | None = None
-) -> Candidates:
-    """Return the first palm poses of an object, see `Drawing`."""
-    return Drawing(model, X_TO, config).candidates(most)
-
-
 def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) -> None:
     """Reject a user-defined sampler whose palms are all far away and do not face the object.
 

@@ -35,7 +35,7 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.candidates import Candidates, palm_attempts, sample_candidates
+from drakegrasp.simulation.candidates import Candidates, Drawing, palm_attempts
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own-sampler.md"
 
@@ -131,7 +131,7 @@ def sampler(text: str, hand: str = "barrett") -> Config:
 def draw(box: ObjectModel, config: Config, count: int = 20) -> Candidates:
     X_TO = np.eye(4)
     X_TO[2, 3] = box.half_extents[2]
-    return sample_candidates(box, X_TO, config, count)
+    return Drawing(box, X_TO, config).candidates(count)
 
 
 def test_the_sampler_of_the_page_looks_at_the_object(own: Path, box: ObjectModel) -> None:

@@ -23,10 +23,10 @@ from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.candidates import (
     Candidates,
+    Drawing,
     normal_candidates,
     palm_attempts,
     palm_ray_distance,
-    sample_candidates,
 )
 from drakegrasp.simulation.samplers import ray_meets_box, rotation_candidates
 
@@ -306,12 +306,12 @@ def test_seed_and_name_decide_the_draw(
 ) -> None:
     config = coarse(method=(method,), max=50)
     namesake = make_object(trimesh.creation.box((0.06, 0.08, 0.10)), "another_box")
-    first, again = (sample_candidates(box, BOX_X_TO, config) for _ in range(2))
+    first, again = (Drawing(box, BOX_X_TO, config).candidates() for _ in range(2))
     np.testing.assert_array_equal(first.X_OG, again.X_OG)
     np.testing.assert_array_equal(first.distance, again.distance)
     for other in (
-        sample_candidates(box, BOX_X_TO, override_config(config, ["seed=1"])),
-        sample_candidates(namesake, BOX_X_TO, config),
+        Drawing(box, BOX_X_TO, override_config(config, ["seed=1"])).candidates(),
+        Drawing(namesake, BOX_X_TO, config).candidates(),
     ):
         shared = {tuple(X.ravel()) for X in first.X_OG} & {tuple(X.ravel()) for X in other.X_OG}
         assert len(shared) < 0.5 * len(first)
@@ -327,7 +327,7 @@ def test_smaller_number_of_turns_is_a_prefix(
     """So more candidates can be tried later without losing the shards of the first."""
     upside_down = BOX_X_TO @ np.diag([1.0, -1.0, -1.0, 1.0])
     poses = np.stack([BOX_X_TO, upside_down])
-    many, few = (sample_candidates(box, poses, coarse(method=method), n) for n in (most, 40))
+    many, few = (Drawing(box, poses, coarse(method=method)).candidates(n) for n in (most, 40))
     assert (len(many), len(few)) == (most, 40)
     for name in ("X_OG", "distance", "resting", "source"):
         np.testing.assert_array_equal(getattr(many, name)[:40], getattr(few, name))
@@ -337,14 +337,14 @@ def test_turns_go_on_without_a_sampler_that_has_no_more(box: ObjectModel) -> Non
     narrow = coarse(local_y_deg=(0,), local_z_deg=(0,), method=("rotations", "normals"))
     half, rules = box.half_extents, narrow.candidates
     distinct = len(rotation_candidates(half, BOX_X_TO, rules, stream()))
-    drawn = sample_candidates(box, BOX_X_TO, narrow, 3 * distinct)
+    drawn = Drawing(box, BOX_X_TO, narrow).candidates(3 * distinct)
     turns = np.resize([Source.ROTATIONS, Source.NORMALS], 2 * distinct)
     np.testing.assert_array_equal(drawn.source[: 2 * distinct], turns)
     assert np.all(drawn.source[2 * distinct :] == Source.NORMALS)
 
 
 def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
-    drawn = sample_candidates(box, BOX_X_TO, coarse())
+    drawn = Drawing(box, BOX_X_TO, coarse()).candidates()
     poses = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, stream())
     assert 0 < len(drawn) == len(poses)
     assert {X.tobytes() for X in drawn.X_OG} == {X.tobytes() for X in poses}
@@ -380,7 +380,7 @@ def test_palm_ray_to_a_box_in_closed_form(box: ObjectModel) -> None:
 
 def test_normals_approach_the_faces_of_a_box_squarely_and_not_from_below(box: ObjectModel) -> None:
     """Gz is minus a face's normal, and the palm ray ends on that face."""
-    drawn = sample_candidates(box, BOX_X_TO, NORMALS)
+    drawn = Drawing(box, BOX_X_TO, NORMALS).candidates()
     z = drawn.X_OG[:, :3, 2]
     np.testing.assert_allclose(np.abs(z).max(axis=1), 1.0, atol=1e-12)
     surface = drawn.X_OG[:, :3, 3] + drawn.distance[:, None] * z

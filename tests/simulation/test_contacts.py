@@ -121,22 +121,6 @@ def test_weak_contacts_do_not_count(closed: Scene) -> None:
         assert bodies_on_object(strict) == (tips if expected[0] else set())
 
 
-def test_weak_contact_of_another_link_does_not_count(closed: Scene) -> None:
-    """All pads moved away: what the fingertips press with is then other links'."""
-    forces = np.linalg.norm(read_contacts(closed).f_Q_O, axis=1)
-    limit = float(forces[:2].mean() + forces[2]) / 2.0
-    strict = replace(closed, physics=closed.physics.model_copy(update={"contact_force": limit}))
-    assert with_pads(closed, NOWHERE, NOWHERE, NOWHERE).other_links == 3
-    assert (
-        with_pads(strict, NOWHERE, NOWHERE, NOWHERE).other_links
-        == (forces > limit).sum()
-        in (
-            1,
-            2,
-        )
-    )
-
-
 #: Two faces of a patch over an edge of the cube: the smaller one carries more.
 AREAS, PRESSURES = np.array([1e-6, 3e-6]), np.array([5e6, 1e6])
 POINTS = np.array([[0.03, 0.0, 0.0], [0.035, 0.01, 0.002]])

@@ -319,24 +319,6 @@ def test_one_finger_that_is_not_required_screens_nothing(cube, hand):
         assert found.outcome is outcome
 
 
-def test_heights_and_distances_are_those_of_the_points(cube, hand):
-    """Lower bounds of the distances from the cube's faces; the least is exact where it matters."""
-    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.01, -0.02, 0.2])
-    lookup = screen.PointLookup(cube.field, standing(cube), X_OG[None])
-    p_GQ = np.array([[0.0, 0.0, 0.16], [0.028, 0.0, 0.2], [0.0, 0.016, 0.163]], dtype=np.float32)
-    p_OQ = p_GQ @ X_OG[:3, :3].T + X_OG[:3, 3]
-    rows = np.array([0])
-    np.testing.assert_allclose(
-        lookup.heights(rows, p_GQ)[0], p_OQ[:, 2] + standing(cube)[2, 3], atol=1e-6
-    )
-    outside = np.maximum(np.abs(p_OQ) - cube.half_extents, 0.0)
-    truth = np.linalg.norm(outside, axis=1)
-    found = lookup.distances(rows, p_GQ, 1.0)[0]
-    error = 2.0 * cube.field.error
-    assert np.all(found <= truth + 1e-4) and np.all(found >= truth - error - 1e-4)
-    assert found.min() == pytest.approx(truth.min(), abs=1e-4)
-
-
 def test_fingers_of_one_motor_start_together(tmp_path):
     """One jaw would meet a box that is off the middle later than the other; it starts with it."""
     model = box_model(tmp_path, [0.03] * 3)
