@@ -165,7 +165,7 @@ def test_a_changed_file_is_another_dataset_wherever_it_lies(own: Path) -> None:
     (own / "my_sampler.py").rename(own / "folder" / "my_sampler.py")
     moved = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])
     assert moved.simulation_hash() == config.simulation_hash()
-    assert re.fullmatch(r"my_sampler\.py:Ring@[0-9a-f]{16}", str(config.candidates.method))
+    assert re.fullmatch(r"my_sampler\.py:Ring@[0-9a-f]{16}", config.candidates.method[0])
     with (own / "folder" / "my_sampler.py").open("a") as file:
         file.write("# changed\n")
     changed = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])
