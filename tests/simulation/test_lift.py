@@ -40,19 +40,26 @@ def close(scene: Scene, cube: ObjectModel) -> None:
     advance(scene, 2.4)
 
 
-def test_lift_with_coarse_steps_ends_as_one_without(scene, cube, config, hand, monkeypatch):
+@pytest.fixture
+def simulated(monkeypatch) -> Counter:
+    """The time that was simulated with each step [s]."""
+    seconds, simulate = Counter(), stepping.advance
+
+    def count(stage: Scene, duration: float) -> None:
+        seconds[stage.physics.time_step] += duration
+        simulate(stage, duration)
+
+    monkeypatch.setattr(stepping, "advance", count)
+    return seconds
+
+
+def test_lift_with_coarse_steps_ends_as_one_without(
+    scene, cube, config, hand, simulated, monkeypatch
+):
     # A cube that is pinched creeps a little all the time: here that counts as rest.
     config = override_config(config, ["close.stop_speed=0.1"])
     monkeypatch.setattr(lifting, "COARSE_SHIFT", 2e-3)
     monkeypatch.setattr(lifting, "COARSE_ANGLE", np.deg2rad(2.0))
-    simulated = Counter()
-    simulate = stepping.advance
-
-    def count(stage: Scene, duration: float) -> None:
-        simulated[stage.physics.time_step] += duration
-        simulate(stage, duration)
-
-    monkeypatch.setattr(stepping, "advance", count)
     attempt = from_above(cube, STANDOFF)
     by_coarse = run_attempt(scene, standing(cube), attempt, config)
     long = config.physics.coarse_steps * config.physics.time_step
@@ -197,16 +204,8 @@ def test_slip_before_the_wrist_moves_is_told_apart(scene, cube, config):
     assert 1e-6 < moved.lift.turn_released < moved.lift.turn
 
 
-def test_long_steps_are_for_what_stands_still_in_the_hand(cube, config, hand, monkeypatch):
+def test_long_steps_are_for_what_stands_still_in_the_hand(cube, config, hand, simulated):
     """Where fingers can be pushed open the cube creeps at each look, and all steps are fine."""
-    simulated = Counter()
-    simulate = stepping.advance
-
-    def count(stage: Scene, duration: float) -> None:
-        simulated[stage.physics.time_step] += duration
-        simulate(stage, duration)
-
-    monkeypatch.setattr(stepping, "advance", count)
     long = config.physics.coarse_steps * config.physics.time_step
     shares = {}
     scene = build_scene(cube, config.physics, hand)

@@ -192,15 +192,8 @@ def test_hand_inside_of_a_ring_does_not_collide(tmp_path, config, hand):
     ring = model_of(
         trimesh.creation.annulus(r_min=0.28, r_max=0.30, height=0.04, sections=64), tmp_path
     )
-    attempt = Attempt(
-        candidate=0,
-        standoff_index=0,
-        standoff=0.1,
-        spread=0.0,
-        X_OG=make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.15]),
-        ray_hits=True,
-        seed=0,
-    )
+    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.15])
+    attempt = Attempt(X_OG=X_OG, spread=0.0)
     scene = build_scene(ring, config.physics, hand)
     everything = override_config(config, ["screen.mode=off"])
     record = run_attempt(scene, standing(ring), attempt, everything)
