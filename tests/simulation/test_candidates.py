@@ -19,7 +19,7 @@ from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
-from drakegrasp.seeding import Stream, object_key
+from drakegrasp.seeding import Stream
 from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.candidates import (
     Candidates,
@@ -348,16 +348,6 @@ def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
     poses = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, stream())
     assert 0 < len(drawn) == len(poses)
     assert {X.tobytes() for X in drawn.X_OG} == {X.tobytes() for X in poses}
-
-
-def test_object_key_is_frozen_and_of_the_name_alone() -> None:
-    """It decides which grasps an object gets: a change would make every dataset another.
-
-    The number is the first four bytes that `printf 24_mug_final | sha256sum` prints.
-    """
-    assert object_key("24_mug_final") == 0x2B63C3F3
-    assert object_key("24_mug_final") != object_key("24_mug_final ")
-    assert 0 <= object_key("é") < 2**32
 
 
 def test_palm_ray_to_a_box_in_closed_form(box: ObjectModel) -> None:
