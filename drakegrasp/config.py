@@ -11,8 +11,9 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -79,49 +80,13 @@ Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
 LONGEST_SHOWN = 200
 
 
-@dataclass(frozen=True)
-class Decides:
-    """A mark of a field, such as `Annotated[Count, NO_SHARD]`, that tells where its value counts.
-
-    Attributes:
-        files: Function of the section and the value: whether files of datasets store the value.
-        shards: Function of the section and the value: whether a stored value affects the content of
-            shards.
-    """
-
-    files: Callable[[Any, Any], bool] = lambda section, value: True
-    shards: Callable[[Any, Any], bool] = lambda section, value: True
-
-
-#: Mark of values that change no shard: they act on assembled shards, or only tell where to stop.
-NO_SHARD = Decides(shards=lambda section, value: False)
-
-
-def _told_unless(usual: Any) -> Decides:
-    """Return the mark of a field that files omit if it has the usual value."""
-    return Decides(files=lambda section, value: value != usual)
-
-
-def _counts_unless(usual: Any) -> Decides:
-    """Return the mark of a field that has no effect on shards if it has the usual value."""
-    return Decides(shards=lambda section, value: value != usual)
+#: Mark of a field, as in `Annotated[Count, NO_SHARD]`, whose value changes no shard: it acts on
+#: assembled shards, or only tells where to stop.
+NO_SHARD = "no shard"
 
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-    def tree(self, *, shards: bool = False) -> dict[str, Any]:
-        """Return the values that files store, or only those that affect shards, as JSON types."""
-        tree = self.model_dump(mode="json")
-        for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            marks = [mark for mark in field.metadata if isinstance(mark, Decides)]
-            counts = [m.files(self, value) and (not shards or m.shards(self, value)) for m in marks]
-            if not all(counts):
-                del tree[name]
-            elif isinstance(value, _Section):
-                tree[name] = value.tree(shards=shards)
-        return tree
 
     @field_validator("*", mode="before")
     @classmethod
@@ -184,7 +149,7 @@ class PhysicsConfig(_Section):
     max_speed: Positive = 10.0  # [m/s], a faster object means that the simulation diverged
     # [N], largest force at the pad point of a fingertip: if one can exert more, all motors are
     # weakened by one factor. Null: the strength of the hand file.
-    finger_load: Annotated[Positive | None, _told_unless(None)] = None
+    finger_load: Positive | None = None
 
     @model_validator(mode="after")
     def _short_enough(self) -> PhysicsConfig:
@@ -237,15 +202,6 @@ class _ExtensibleSection(_Section):
         return section
 
 
-def _samplers(value: Any, info: ValidationInfo) -> str | tuple[str, ...]:
-    """Return the name of a sampler, or the names of samplers that take turns."""
-    names = value if isinstance(value, list | tuple) else [value]
-    if not names or not all(_is_named("samplers", name, info) for name in names):
-        known = ", ".join(registry.names("samplers"))
-        raise ValueError(f"must be one of {known}, FILE.py:NAME, or a list of them, got {value!r}")
-    return tuple(names) if names is value else str(value)
-
-
 def _is_named(kind: registry.Kind, name: object, info: ValidationInfo) -> bool:
     """Return whether a value names a user-defined class or an entry of the registry.
 
@@ -257,12 +213,12 @@ def _is_named(kind: registry.Kind, name: object, info: ValidationInfo) -> bool:
     return is_own_class(name) or stored or registry.is_known(kind, name)
 
 
-def _own_filters(value: Any, info: ValidationInfo) -> tuple[str, ...]:
-    """Return the names of user-defined filters; an empty tuple for null."""
+def _named(kind: registry.Kind, value: Any, info: ValidationInfo) -> tuple[str, ...]:
+    """Return a list of names; a name alone is a list of one, and null an empty list."""
     names = value if isinstance(value, list | tuple) else [] if value is None else [value]
-    if not all(_is_named("rules", name, info) for name in names):
-        rules = ", ".join((*registry.names("rules"), "FILE.py:NAME"))
-        must = f"one of {rules}" if registry.names("rules") else rules
+    if not all(_is_named(kind, name, info) for name in names):
+        known = (*registry.names(kind), "FILE.py:NAME")
+        must = f"one of {', '.join(known)}" if len(known) > 1 else known[0]
         raise ValueError(f"must be {must}, or a list of them, got {value!r}")
     return tuple(names)
 
@@ -274,12 +230,16 @@ MOST_PALMS = 10_000
 class CandidateConfig(_ExtensibleSection):
     """The palm poses to try."""
 
-    # Sampler, or a list of samplers that take turns; a sampler that is named twice gets two turns.
-    # A user-defined sampler is `file.py:Name`.
-    method: Annotated[str | tuple[str, ...], BeforeValidator(_samplers)] = "rotations"
+    # Samplers that take turns; a sampler that is named twice gets two turns. A user-defined sampler
+    # is `file.py:Name`.
+    method: Annotated[
+        tuple[str, ...],
+        Field(min_length=1),
+        BeforeValidator(partial(_named, "samplers")),
+    ] = ("rotations",)
     # Palm poses per object; if there are more, they are thinned at random with the seed (paper). A
     # dataset may grow.
-    max: Annotated[Count, NO_SHARD] = MOST_PALMS
+    max: Count = MOST_PALMS
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
     global_y_deg: Angles = tuple(range(0, 360, 30))
     global_z_deg: Angles = tuple(range(0, 360, 45))
@@ -288,20 +248,13 @@ class CandidateConfig(_ExtensibleSection):
     local_z_deg: Angles = tuple(range(0, 360, 45))
     jitter_deg: NonNegative = 0.0  # each angle gets a random whole number of degrees below this
     # Digest of the postures that are tried instead of sampled palm poses; `--postures` sets it.
-    postures: Annotated[
-        Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None, _told_unless(None)
-    ] = None
+    postures: Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None = None
     # [m] of the palm from the surface, one attempt each (paper); default: those of the hand.
     standoffs: Standoffs
     # One is drawn per attempt (released code); default: those of the hand.
     spreads_deg: Annotated[
         tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
     ]
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """The samplers that take turns."""
-        return (self.method,) if isinstance(self.method, str) else self.method
 
 
 class ScreenConfig(_Section):
@@ -331,10 +284,6 @@ class CloseConfig(_Section):
     scrape_depth: NonNegative | None = 5e-4
 
 
-#: Mark of settings that end lifts early; if unused, hashes are those of versions without them.
-_STOPS = Decides(shards=lambda lift, _: lift.stop_when != "never")
-
-
 class LiftConfig(_Section):
     """Releasing the object and moving the wrist to the target."""
 
@@ -351,10 +300,9 @@ class LiftConfig(_Section):
     check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
     # "lost_sample" ends a lift, as `moved`, when the object has moved more in the hand than the
     # next two limits at a check: filters must then have limits at least as strict.
-    stop_when: Annotated[Literal["never", "lost_sample"], _STOPS] = "never"
-    # [m], of the object in the hand since its release
-    stop_slip: Annotated[Positive, _STOPS] = 0.010
-    stop_turn_deg: Annotated[Positive, _STOPS] = 10.0  # of the object since its release
+    stop_when: Literal["never", "lost_sample"] = "never"
+    stop_slip: Positive = 0.010  # [m], of the object in the hand since its release
+    stop_turn_deg: Positive = 10.0  # of the object since its release
 
 
 class RobustnessConfig(_Section):
@@ -470,10 +418,9 @@ def _filter_config() -> type[_Filters]:
     settings: dict[str, Any] = {}
     for name, limit in LIMITS.items():
         kind = _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind]
-        told = _told_unless(limit.default) if limit.later else Decides()
-        settings[name] = (Annotated[kind, told], limit.default)
+        settings[name] = (kind, limit.default)
     # User-defined filters: `file.py:Name`, or the name of a rule of another package.
-    own = Annotated[tuple[str, ...], BeforeValidator(_own_filters), _told_unless(())]
+    own = Annotated[tuple[str, ...], BeforeValidator(partial(_named, "rules"))]
     settings["own"] = (own, ())
     doc = "Which successes become samples, decided when the files are assembled; null: no limit."
     return create_model("FilterConfig", __base__=_Filters, __doc__=doc, **settings)
@@ -569,12 +516,10 @@ class Config(_Section):
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
-    robustness: Annotated[RobustnessConfig, Decides(shards=lambda _, it: it.repeats)] = (
-        RobustnessConfig()
-    )
+    robustness: RobustnessConfig = RobustnessConfig()
     camera: CameraConfig = CameraConfig()
-    randomize: Annotated[RandomizeConfig, _counts_unless(RandomizeConfig())] = RandomizeConfig()
-    scenes: Annotated[ScenesConfig, NO_SHARD, _told_unless(ScenesConfig())] = ScenesConfig()
+    randomize: RandomizeConfig = RandomizeConfig()
+    scenes: Annotated[ScenesConfig, NO_SHARD] = ScenesConfig()
     # Number of successes of an object after which it is no longer tried.
     max_grasps: Annotated[Count | None, NO_SHARD] = None
     # Number of samples after which a build stops: of all objects together, which contribute evenly,
@@ -620,12 +565,8 @@ class Config(_Section):
         return self
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the resolved values as plain JSON types.
-
-        Values whose mark `Decides` excludes them from files are omitted. `parse_stored` is the
-        inverse.
-        """
-        return self.tree()
+        """Return the resolved values as plain JSON types; `parse_stored` is the inverse."""
+        return self.model_dump(mode="json")
 
     @property
     def has_target(self) -> bool:
@@ -639,7 +580,7 @@ class Config(_Section):
 
     def with_code(self, code: Mapping[str, str]) -> Config:
         """Return the configuration with source texts; each section keeps those of its classes."""
-        named = (("candidates", self.candidates.methods), ("filters", self.filters.own))
+        named = (("candidates", self.candidates.method), ("filters", self.filters.own))
         update = {
             key: getattr(self, key).with_code({n: code[n] for n in names if n in code})
             for key, names in named
@@ -667,11 +608,13 @@ class Config(_Section):
     def simulation_hash(self) -> str:
         """Return the hash (16 hex digits) of all values that affect the content of shards.
 
-        The marks of the fields determine the omitted values, see `Decides`. The hash contains the
-        name of the hand file, but not its folder; the digest of the hand's files is in the
-        manifest's versions.
+        Values with the mark `NO_SHARD` are left out, and the number of palm poses, so that a
+        dataset may grow. The hash contains the name of the hand file, but not its folder; the
+        digest of the hand's files is in the manifest's versions.
         """
-        values = {**self.tree(shards=True), "hand": PurePath(self.hand).stem}
+        left_out = dict.fromkeys(POSTPROCESSING_KEYS, True)
+        values = self.model_dump(mode="json", exclude={**left_out, "candidates": {"max"}})
+        values["hand"] = PurePath(self.hand).stem
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -860,7 +803,7 @@ def ways_to_grasps(config: Config | None = None) -> str:
     """
     ways = []
     rules = None if config is None else config.candidates
-    if rules is None or ("normals" not in rules.methods and rules.postures is None):
+    if rules is None or ("normals" not in rules.method and rules.postures is None):
         ways.append("palm poses that face the surface (--set candidates.method=normals)")
     if config is None or config.objects.resting_poses == 1:
         ways.append("more resting poses (--set objects.resting_poses=4)")

@@ -62,15 +62,12 @@ class Limit:
         kind: Kind of numbers that are allowed.
         meaning: What the setting limits, with its unit.
         off: Value that switches the filter off, if there is one.
-        later: Whether it is newer than the first datasets of this schema. Its default is then not
-            stored in a dataset, so that older datasets can be continued.
     """
 
     default: float | None
     kind: Literal["number", "positive", "not negative", "count"]
     meaning: str
     off: Literal["", "null", "zero"] = ""
-    later: bool = False
 
 
 #: The settings of the filters; those of the hold are own choices, see docs/reference/outcomes.md.
@@ -116,7 +113,7 @@ LIMITS = {
         None, "positive", "sum of the contact normals, per finger: 0 balanced, 1 not", "null"
     ),
     "max_slip_use": Limit(
-        None, "positive", "fraction of its friction cone that a fingertip uses", "null", later=True
+        None, "positive", "fraction of its friction cone that a fingertip uses", "null"
     ),
 }
 

@@ -5,6 +5,8 @@ maps coordinates in B to coordinates in A), `R_AB` its rotation, `p_AB` its tran
 matches neighbouring letters: `X_AC = multiply(X_AB, X_BC)` (`arithmetic.multiply`, whose bits do
 not depend on the CPU).
 
+`Frame` names the frames in which a caller may give or ask for grasps.
+
 Letters: W world, T table-top centre, O object (centre of the mesh's bounding box), Ocm its centre
 of mass, G palm (+Gz out of the palm), Fi distal link of finger i, Qi contact point of finger i,
 C camera (+X right, +Y down, +Z forward), I image frame.
@@ -15,6 +17,8 @@ row-major. Drake's `RigidTransform` is used only where Drake is called.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -104,6 +108,61 @@ def rotation_angle(R_AB: npt.ArrayLike) -> float:
 
 #: Pose of the table-top frame T in the world.
 X_WT = make_pose(np.eye(3), P_WT)
+
+
+class Frame(StrEnum):
+    """The frames of grasps that a caller gives or asks for."""
+
+    OBJECT = "object"  # {O}
+    TABLE = "table"  # {T}
+    CAMERA = "camera"  # {C}
+    WORLD = "world"  # {W}
+    MESH = "mesh"  # {M}, the axes and the origin of the mesh file
+    PALM = "palm"  # {G}
+
+
+def refuse_other_frames(frame: object, known: Sequence[Frame]) -> None:
+    """Reject anything but the name of one of these frames.
+
+    Raises:
+        GraspError: If it is none of them.
+    """
+    if frame not in known:
+        raise GraspError(f"frame must be one of {', '.join(known)}, got {frame!r}")
+
+
+def frame_in_object(
+    frame: str,
+    X_TO: Array | None,
+    X_OM: Array | None = None,
+    X_TC: Array | None = None,
+) -> Array:
+    """Return the pose X_OF (4, 4) of a frame {F} in {O}.
+
+    Args:
+        frame: A `Frame`, except for the palm.
+        X_TO: Pose (4, 4) of the object on the table, for any frame but "object" and "mesh".
+        X_OM: Pose (4, 4) of the mesh file's frame in {O}, for the frame "mesh".
+        X_TC: Pose (4, 4) of the camera in {T}, for the frame "camera".
+
+    Raises:
+        GraspError: If a pose is not given that the frame needs.
+    """
+    if frame == Frame.OBJECT:
+        return np.eye(4)
+    if frame == Frame.MESH:
+        return _given(X_OM, "X_OM", frame)
+    X_OT = invert_pose(_given(X_TO, "X_TO", frame))
+    if frame == Frame.TABLE:
+        return X_OT
+    X_TF = invert_pose(X_WT) if frame == Frame.WORLD else _given(X_TC, "X_TC", frame)
+    return multiply(X_OT, X_TF)
+
+
+def _given(X: Array | None, name: str, frame: str) -> Array:
+    if X is None:
+        raise GraspError(f"{name} must be given with the frame {frame}, got None")
+    return X
 
 
 def without_torch(value: Any) -> Any:

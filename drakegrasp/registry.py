@@ -12,7 +12,7 @@ importers: a function (path, hand) that returns arguments of `simulation.attempt
     None for a file of another format. The name ends with the suffix of the files.
 protocols: a subclass of `protocols.protocol.MujocoProtocol`, except for `lift`.
 rules: a `filters.Rule`. The package's own rules are `filters.RULES`; each has a limit and a code.
-samplers: a `simulation.candidates.Sampler`, or a class with the signature of user-defined samplers.
+samplers: a `simulation.candidates.Sampler`, like a user-defined one.
 
 A user-defined class is named `file.py:Name`, and imported from the file's text. A configuration
 stores the name without folders, followed by 16 digits of the file's SHA-256, so that a changed file

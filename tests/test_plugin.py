@@ -29,7 +29,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.protocols.protocol import DexGraspBench, find_protocol
 from drakegrasp.protocols.scene import ProtocolScene
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.candidates import sample_candidates
+from drakegrasp.simulation.candidates import Drawing
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "examples" / "plugin"
 PACKAGE = "drakegrasp-example-plugin"
@@ -74,7 +74,7 @@ def test_sampler_draws_palms_that_look_down(tmp_path: Path) -> None:
     bar = box_model(tmp_path, np.array([0.10, 0.02, 0.03]))
     X_TO = make_pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), [0.0, 0.0, 0.01])
     config = load_config("paper", ["candidates.method=down", "seed=3"])
-    drawn, again = (sample_candidates(bar, X_TO, config, 8) for _ in range(2))
+    drawn, again = (Drawing(bar, X_TO, config).candidates(8) for _ in range(2))
     np.testing.assert_allclose((X_TO @ drawn.X_OG)[:, 2, 2], -1.0, atol=1e-12)
     np.testing.assert_array_equal(drawn.X_OG, again.X_OG)
     assert len(np.unique(drawn.X_OG[:, 0, 0])) > 1

@@ -116,7 +116,7 @@ def test_a_dataset_opens_where_its_sampler_and_its_rule_are_not_installed() -> N
     tree["candidates"]["method"] = ["ring", "normals"]
     tree["filters"]["own"] = ["calm"]
     config = parse_stored(tree)
-    assert config.candidates.methods == ("ring", "normals")
+    assert config.candidates.method == ("ring", "normals")
     assert config.filters.own == ("calm",)
     with pytest.raises(ConfigError, match=r"candidates\.method: must be one of rotations"):
         parse_config(tree)

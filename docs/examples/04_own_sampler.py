@@ -17,7 +17,7 @@ from drakegrasp.frames import make_pose
 class Above:
     """Palms straight above the object that look down, turned by a random angle."""
 
-    def __init__(self, model, X_TO, stream):
+    def __init__(self, model, X_TO, stream, config):
         self.up = X_TO[2, :3]  # the table's normal in the object frame {O}
         self.height = np.linalg.norm(model.half_extents)
         self.stream = stream  # random numbers of the seed and the object: use no others

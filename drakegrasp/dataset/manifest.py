@@ -123,10 +123,7 @@ class ObjectEntry:
             configuration's coefficients.
         collision_error: Largest distance between mesh and collision surface [m].
         resting: Resting poses of the object.
-        candidates: Number of palm poses to try, drawn from the distinct ones.
-        combinations: Number of combinations of rotations that were considered.
-        valid: Number of those above the table whose palm ray meets the bounding box.
-        distinct: Number of different palm poses among the valid ones.
+        candidates: Number of palm poses to try.
         notes: What was repaired in the mesh.
         licence: Identifier of the mesh's licence; None: not stated.
         tried: Number of palm poses that the dataset takes, because a target was met; None: all.
@@ -150,9 +147,6 @@ class ObjectEntry:
     collision_error: NonNegative
     resting: Annotated[tuple[RestingEntry, ...], Field(min_length=1)]
     candidates: NonNegativeCount
-    combinations: Whole
-    valid: Whole
-    distinct: Whole
     notes: tuple[str, ...]
     licence: Licence | None = None
     tried: Whole | None = None
@@ -417,13 +411,6 @@ def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
     for name, count in Counter(entry.name for entry in stored.objects).items():
         if count > 1:
             yield f"objects must have a name each, got {name!r} twice"
-    for i, entry in enumerate(stored.objects):
-        numbers = (entry.candidates, entry.distinct, entry.valid, entry.combinations)
-        if list(numbers) != sorted(numbers):
-            yield (
-                f"objects.{i}: candidates, distinct, valid and combinations must rise, "
-                f"got {', '.join(map(str, numbers))}"
-            )
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:

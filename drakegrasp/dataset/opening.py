@@ -477,7 +477,7 @@ POSTURE_FIELDS = (
 POSTURE_TEXTS = (_array("said", "", "uint8"), _array("preshape", "", "uint8", optional=True))
 _PLAN_ATTRIBUTES = {
     **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
-    **dict.fromkeys(("combinations", "valid", "distinct", "asked"), COUNT),
+    "asked": COUNT,
 }
 
 

@@ -11,7 +11,6 @@ import json
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -41,10 +40,8 @@ _OF_MODEL = (
     *("name", "class_name", "mesh_sha256", "scale", "up", "mass", "density", "friction"),
     *("collision_error", "notes"),
 )
-#: Fields of the entry that come from the object's candidates.
-_COUNTS = ("combinations", "valid", "distinct")
 #: Fields of the entry that change when more palm poses are drawn.
-_DRAWN = (*_COUNTS, "candidates", "ended")
+_DRAWN = ("candidates", "ended")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,7 +87,6 @@ class PreparedObject:
             resting=resting,
             candidates=len(self.candidates),
             ended=len(self.candidates) < self.asked,
-            **{name: getattr(self.candidates, name) for name in _COUNTS},
         )
 
 
@@ -114,8 +110,6 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         file.attrs["config_hash"] = config.simulation_hash()
         file.attrs["mesh_sha256"] = model.mesh_sha256
         file.attrs["asked"] = prepared.asked
-        for name in _COUNTS:
-            file.attrs[name] = getattr(candidates, name)
         arrays = {**vars(candidates), **vars(prepared), "X_TO": prepared.resting_poses}
         for field in chain(*PLAN_TABLES):
             file.create_dataset(field.name, data=arrays[field.name], dtype=field.dtype)
@@ -153,16 +147,11 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     due = config.simulation_hash()
     if attributes["config_hash"] != due:
         raise DataError(f"{path}: must be of configuration {due}, got {attributes['config_hash']}")
-    counts: dict[str, Any] = {name: int(attributes[name]) for name in _COUNTS}
     return PreparedObject(
         model=load_object(model_path(out, name)),
         resting_poses=resting.pop("X_TO"),
         **resting,
-        candidates=Candidates(
-            **palms,
-            **counts,
-            postures=_given_postures(given, path),
-        ),
+        candidates=Candidates(**palms, postures=_given_postures(given, path)),
         asked=int(attributes["asked"]),
     )
 

@@ -30,13 +30,14 @@ from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS
 from drakegrasp.dataset.trials import Trials, reopened, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
-from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
+from drakegrasp.frames import X_WT, Frame, invert_pose, pack_pose, unpack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 
-Frame = Literal["table", "camera"]
+#: Frames of the grasps of a view.
+FRAMES = (Frame.TABLE, Frame.CAMERA)
 #: Which failed grasps are drawn: `tested`, hands that were lifted and lost the object; `closed`,
 #: these and hands that closed without all fingertips on the object; `none`.
 Negatives = Literal["tested", "closed", "none"]
@@ -130,7 +131,7 @@ class SceneDataset:
         path: str | Path,
         *,
         points: int | None = 2048,
-        frame: Frame = "table",
+        frame: str = Frame.TABLE,
         negatives: Negatives = "tested",
         balance: Balance = "object",
         split: str = "train",
@@ -142,7 +143,7 @@ class SceneDataset:
         seed: int = 0,
         cache: int = 512 << 20,
     ) -> None:
-        _refuse_other("frame", frame, get_args(Frame))
+        _refuse_other("frame", frame, FRAMES)
         _refuse_other("negatives", negatives, get_args(Negatives))
         _refuse_other("balance", balance, get_args(Balance))
         _refuse_other("positives", positives, get_args(Positives))
@@ -234,9 +235,9 @@ class SceneDataset:
         """Return a sampler for torch's DataLoader: each round has all items in a new order."""
         return Rounds(self, seed)
 
-    def grasps_in(self, view: int, *, frame: Frame = "table") -> dict[str, AnyArray]:
+    def grasps_in(self, view: int, *, frame: str = Frame.TABLE) -> dict[str, AnyArray]:
         """Return all g grasps of a view's scene, by the keys of an item."""
-        _refuse_other("frame", frame, get_args(Frame))
+        _refuse_other("frame", frame, FRAMES)
         X_AT = invert_pose(self._X_TC[view]) if frame == "camera" else np.eye(4)
         return self._grasps_of(view, self.rows_in(self._scene_of[view]), X_AT)
 

@@ -585,11 +585,7 @@ OBJECT_FIELDS: tuple[Field, ...] = (
           "apply"),
     Field("collision_error", "", "float64", "m", "-",
           "largest distance between mesh and collision surface"),
-    Field("combinations", "", "int64", "-", "-", "number of combinations of rotations"),
-    Field("valid", "", "int64", "-", "-",
-          "number of combinations above the table whose palm ray meets the bounding box"),
-    Field("distinct", "", "int64", "-", "-", "number of distinct palm poses among them"),
-    Field("candidates", "", "int64", "-", "-", "number of palm poses drawn from the distinct ones"),
+    Field("candidates", "", "int64", "-", "-", "number of palm poses"),
 )
 
 #: A row per predicted grasp, in the order of the input, in `/grasps` of the results of

@@ -447,7 +447,7 @@ def why_no_sample(outcomes: AnyArray, removals: AnyArray, config: Config) -> Sho
         config: Configuration of the dataset, which states what was already tried.
     """
     total = int(outcomes.sum())
-    if not total and "closing" in config.candidates.methods:
+    if not total and "closing" in config.candidates.method:
         ways = "palm poses that face the surface (--set candidates.method=normals)"
         return Shortfall(
             "the hand closes well on it from no side", f"{ways}, or another hand (--set hand=NAME)"

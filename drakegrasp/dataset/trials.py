@@ -1,7 +1,7 @@
 """Reading the attempts of a dataset, whatever their outcome. Imports only h5py and NumPy.
 
 >>> held = Trials("OUT").where(outcome="success", object_name="mug")   # doctest: +SKIP
->>> held["slip"].max(), held.contacts(frame="T").points.shape          # doctest: +SKIP
+>>> held["slip"].max(), held.contacts(frame="table").points.shape      # doctest: +SKIP
 (0.0093, (27, 3, 3))
 """
 
@@ -34,15 +34,15 @@ from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, SPLITS, TRIAL_FIEL
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard, trial_columns
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
-from drakegrasp.frames import X_WT, invert_pose, unpack_pose
+from drakegrasp.frames import X_WT, Frame, invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.table import Table
 
 if TYPE_CHECKING:
     import pandas
 
-#: Frames in which contacts can be returned: object, table top, palm, world.
-Frame = Literal["O", "T", "G", "W"]
+#: Frames in which contacts can be returned.
+FRAMES = (Frame.OBJECT, Frame.TABLE, Frame.PALM, Frame.WORLD)
 #: Code of a removal or a split that an attempt does not have.
 NONE = 255
 #: Number of rows that are read at once: 8 chunks of a column.
@@ -281,7 +281,7 @@ class Trials:
             yield self._nothing(names)
 
     def contacts(
-        self, when: Literal["closed", "lifted"] = "closed", *, frame: Frame = "O"
+        self, when: Literal["closed", "lifted"] = "closed", *, frame: str = Frame.OBJECT
     ) -> Table:
         """Return the contacts of the n attempts, of k fingers, in one frame.
 
@@ -292,16 +292,16 @@ class Trials:
 
         Args:
             when: `closed` for the instant after closing, `lifted` for that after the lift.
-            frame: Frame of the result: `O` the object's, `T` the table top's, `G` the palm's, `W`
-                the world's; after the lift, object and palm are at their poses of that instant.
+            frame: Frame of the result: "object", "table", "palm" or "world"; after the lift,
+                object and palm are at their poses of that instant.
 
         Raises:
             DataError: If there is no such moment or frame.
         """
         if when not in ("closed", "lifted"):
             raise DataError(f"when must be closed or lifted, got {when!r}")
-        if frame not in ("O", "T", "G", "W"):
-            raise DataError(f"frame must be O, T, G or W, got {frame!r}")
+        if frame not in FRAMES:
+            raise DataError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
 
         # Contacts in {O}, and the poses of object and palm at that moment.
         lifted = "_lifted" if when == "lifted" else ""
@@ -312,9 +312,9 @@ class Trials:
         touching, points, normals, forces = (columns[key] for key in keys)
 
         # Transform them to the requested frame.
-        if frame == "O":
+        if frame == Frame.OBJECT:
             return Table(touching=touching, points=points, normals=normals, forces=forces)
-        X_FO = {"T": X_TO, "G": invert_pose(X_OG), "W": multiply(X_WT, X_TO)}[frame]
+        X_FO = {"table": X_TO, "palm": invert_pose(X_OG), "world": multiply(X_WT, X_TO)}[frame]
         R_OF = np.swapaxes(X_FO[:, :3, :3], -1, -2)
         return Table(
             touching=touching,

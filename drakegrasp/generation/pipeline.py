@@ -179,7 +179,7 @@ def ended(config: Config) -> Config:
     Without a target and a number of palm poses, samplers without an end would go on for hours.
     """
     rules = config.candidates
-    endless = "closing" in rules.methods and rules.postures is None
+    endless = "closing" in rules.method and rules.postures is None
     if config.has_target or not endless or rules.max != MOST_PALMS:
         return config
     return config.model_copy(update={"samples_per_object": SAMPLES_PER_OBJECT})

@@ -78,8 +78,7 @@ def override_config(config: Config, overrides: Sequence[str], **values: Any) -> 
     Raises:
         ConfigError, HandError: See `load_config`.
     """
-    # Use all keys: a key that `to_dict` leaves out would become the default.
-    tree, known = config.model_dump(mode="json"), config.to_dict()
+    tree, known = config.to_dict(), config.to_dict()
     for text in overrides:
         apply_override(tree, text)
     tree.update({key: value for key, value in values.items() if value is not None})

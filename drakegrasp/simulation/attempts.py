@@ -12,7 +12,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,11 +23,12 @@ from drakegrasp.config import Config
 from drakegrasp.errors import NAMED, GraspError, listed
 from drakegrasp.frames import (
     FARTHEST,
-    X_WT,
     Array,
+    Frame,
     as_numbers,
-    invert_pose,
+    frame_in_object,
     make_pose,
+    refuse_other_frames,
 )
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
@@ -45,9 +46,8 @@ from drakegrasp.simulation.posture import (
 from drakegrasp.simulation.settle import SAME_UP
 from drakegrasp.table import Table
 
-#: Frames of a table: the frames of a posture, and {M}, the axes and the origin of the mesh file.
-TableFrame = Literal["object", "table", "camera", "world", "mesh"]
-TABLE_FRAMES: tuple[str, ...] = get_args(TableFrame)
+#: Frames of the rows of a table.
+TABLE_FRAMES = (Frame.OBJECT, Frame.TABLE, Frame.CAMERA, Frame.WORLD, Frame.MESH)
 #: Upper bound of the index of a resting pose; no object has so many.
 MOST_POSES = 1e6
 #: Value of `resting` if a row names no resting pose; all resting poses of the object are tried.
@@ -272,30 +272,6 @@ class Attempts(GraspRows):
         return digest.hexdigest()[:16]
 
 
-def frame_in_object(frame: str, X_TO: Array, X_OM: Array | None, X_TC: Array | None) -> Array:
-    """Return the pose X_OA (4, 4) of a frame in {O}.
-
-    Args:
-        frame: One of `TABLE_FRAMES`.
-        X_TO: Pose (4, 4) of the object on the table.
-        X_OM: Pose (4, 4) of the mesh file's frame in {O}, for the frame "mesh".
-        X_TC: Pose (4, 4) of the camera in {T}, for the frame "camera".
-
-    Raises:
-        GraspError: If the frame is "mesh" and its pose is not given.
-    """
-    if frame == "object":
-        return np.eye(4)
-    if frame == "mesh":
-        if X_OM is None:
-            raise GraspError("X_OM must be given for the frame mesh, got None")
-        return X_OM
-    X_OT = invert_pose(X_TO)
-    if frame == "table":
-        return X_OT
-    return multiply(X_OT, invert_pose(X_WT) if X_TC is None else X_TC)
-
-
 def ranked(table: Rows, of: Sequence[Any] | npt.NDArray[Any]) -> Rows:
     """Return a table with the rank of each row among the rows with the same target.
 
@@ -493,8 +469,7 @@ def read_confidence(stated: Any, shape: tuple[int, ...], invalid: Sequence[str] 
 def _refuse_table(count: int, frame: str, X_TC: npt.ArrayLike | None) -> None:
     if not count:
         raise GraspError("postures must be at least one row, got none")
-    if frame not in TABLE_FRAMES:
-        raise GraspError(f"frame must be one of {', '.join(TABLE_FRAMES)}, got {frame!r}")
+    refuse_other_frames(frame, TABLE_FRAMES)
     if (X_TC is None) == (frame == "camera"):
         raise GraspError("X_TC must be given with the frame camera, and only then")
 
@@ -819,9 +794,6 @@ def given_candidates(
         source=np.full(count, Source.POSTURES, dtype=np.int64),
         spread=np.full(count, np.nan),
         preshape_index=np.full(count, -1),
-        combinations=count,
-        valid=count,
-        distinct=count,
         postures=Table({name: getattr(table, name) for name in _IN_PLAN}),
     )
 

@@ -17,10 +17,9 @@ as rounded integers, and random numbers come from `seeding`.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import count, islice
+from itertools import islice
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -36,14 +35,14 @@ from drakegrasp.hand.finger_sweep import has_paths
 from drakegrasp.mesh.crossings import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.registry import own_class, run_own
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.palms import Shape
 from drakegrasp.simulation.samplers import (
-    OwnPoses,
     above_table,
+    checked_poses,
     make_poses,
-    own_sampler,
     rotation_candidates,
 )
 from drakegrasp.table import Table
@@ -72,9 +71,6 @@ class Candidates:
             ray to each stand-off, with drawn spreads.
         preshape_index: (n,), index of the preshape of each palm; -1 if there is none, or it is
             drawn.
-        combinations: Number of combinations of rotations, or of surface points drawn.
-        valid: Number of combinations above the table whose palm ray meets the bounding box.
-        distinct: Number of different poses among the valid ones.
         postures: Columns `q_grasp`, `q_pregrasp`, `q_squeeze`, `row`, `said` and `preshape` of
             `Attempts`, if the poses come from outside; None if they come from samplers.
     """
@@ -85,9 +81,6 @@ class Candidates:
     source: npt.NDArray[np.int64]
     spread: Array
     preshape_index: npt.NDArray[np.int64]
-    combinations: int
-    valid: int
-    distinct: int
     postures: Table | None = None
 
     def __len__(self) -> int:
@@ -110,7 +103,7 @@ class Candidates:
 DRAWN = Shape(None, np.nan)
 #: The resting pose and the sampler of a palm.
 Place: TypeAlias = tuple[int, str]
-#: What a sampler may take; only those of the package take the last one.
+#: What every sampler takes.
 ARGUMENTS = ("model", "X_TO", "stream", "config")
 #: A palm pose X_OG (4, 4) that is moved along its ray to each stand-off, with drawn spreads; or one
 #: that is tried as it is, with the shape of the hand.
@@ -118,7 +111,10 @@ Palm: TypeAlias = Array | tuple[Array, Shape]
 
 
 class Sampler(Protocol):
-    """The palms of an object at a resting pose."""
+    """The palms of an object at a resting pose, of the package, the user or another package."""
+
+    def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream, config: Config) -> None:
+        """Take the object, its resting pose (4, 4), random numbers, and the configuration."""
 
     def poses(self) -> Iterator[Palm | None]:
         """Yield the palms; they do not depend on how many are taken.
@@ -132,41 +128,27 @@ class Rotations:
 
     def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream, config: Config) -> None:
         """Enumerate and shuffle the poses."""
-        poses, combinations, valid = rotation_candidates(
-            model.half_extents, X_TO, config.candidates, stream
-        )
+        poses = rotation_candidates(model.half_extents, X_TO, config.candidates, stream)
         self._poses = poses[stream.permutation(len(poses))]
-        self._counts = combinations, valid, len(poses)
 
     def poses(self) -> Iterator[Array]:
         """Yield the poses."""
         yield from self._poses
 
-    def counts(self, count: int) -> tuple[int, int, int]:
-        """Return the numbers of all combinations, valid and distinct ones."""
-        return self._counts
-
 
 class Normals:
     """Poses above the table that look at random surface points, see `normal_candidates`."""
 
-    def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream) -> None:
+    def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream, config: Config) -> None:
         """Draw nothing yet."""
         self._model, self._X_TO, self._stream = model, X_TO, stream
-        self._numbers: list[int] = []
 
     def poses(self) -> Iterator[Array]:
         """Yield the poses without end."""
         # A solid has faces that look up, and palms above these faces are above the table.
-        for first in count(0, BLOCK):
+        while True:
             poses = normal_candidates(self._model, BLOCK, self._stream)
-            for i in np.flatnonzero(above_table(poses[:, :3, 3], self._X_TO)).tolist():
-                self._numbers.append(first + i)
-                yield poses[i]
-
-    def counts(self, count: int) -> tuple[int, int, int]:
-        """Return the number of surface points up to the last pose; number of poses, twice."""
-        return self._numbers[count - 1] + 1 if count else 0, count, count
+            yield from poses[above_table(poses[:, :3, 3], self._X_TO)]
 
 
 class Drawing:
@@ -186,21 +168,14 @@ class Drawing:
         """
         # One sampler for each method at each resting pose; a method that is named twice has two
         # turns.
-        methods = config.candidates.methods
         resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
-        places = [(k, method) for method in methods for k in range(len(resting))]
-        self._model, self._most = model, config.candidates.max
-        self._samplers = {
-            (k, method): found_sampler(
-                method,
-                config,
-                model,
-                resting[k],
-                _sampler_stream(model.name, config.seed, k, method),
-            )
+        places = [(k, method) for method in config.candidates.method for k in range(len(resting))]
+        palms = {
+            (k, method): _palms(method, k, model, resting[k], config)
             for k, method in dict.fromkeys(places)
         }
-        self._more, self._turns = _turns(places, self._samplers), list[tuple[Place, Palm]]()
+        self._model, self._most = model, config.candidates.max
+        self._more, self._turns = _turns(places, palms), list[tuple[Place, Palm]]()
 
     def candidates(self, most: int | None = None) -> Candidates:
         """Return the first palm poses, drawn with the seed, with their palm rays.
@@ -215,38 +190,22 @@ class Drawing:
         self._turns += islice(self._more, max(0, most - len(self._turns)))
         turns, model = self._turns[:most], self._model
 
-        # The poses, and the numbers of combinations from which they come.
-        used = Counter(place for place, _ in turns)
-        counts = [
-            sampler.counts(used[place]) if hasattr(sampler, "counts") else (used[place],) * 3
-            for place, sampler in self._samplers.items()
-        ]
-        combinations, valid, distinct = (sum(numbers) for numbers in zip(*counts, strict=True))
         palms = [palm if isinstance(palm, tuple) else (palm, DRAWN) for _, palm in turns]
         poses = np.array([X_OG for X_OG, _ in palms]).reshape(-1, 4, 4)
         distance = palm_ray_distance(model.collision, poses)
-        for method in {of for _, of in self._samplers if _source(of) is Source.OWN}:
-            of_method = [of == method for (_, of), _ in turns]
+        methods = [method for (_, method), _ in turns]
+        for method in {of for of in methods if _source(of) is Source.OWN}:
+            of_method = [of == method for of in methods]
             _refuse_far(method, model, poses[of_method], distance[of_method])
         preshapes = [-1 if shape.preshape is None else shape.preshape for _, shape in palms]
         return Candidates(
             X_OG=poses,
             distance=distance,
             resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
-            source=np.array([_source(method) for (_, method), _ in turns], dtype=np.int64),
+            source=np.array([_source(method) for method in methods], dtype=np.int64),
             spread=np.array([shape.spread for _, shape in palms], dtype=float),
             preshape_index=np.array(preshapes, dtype=np.int64),
-            combinations=combinations,
-            valid=valid,
-            distinct=distinct,
         )
-
-
-def sample_candidates(
-    model: ObjectModel, X_TO: npt.ArrayLike, config: Config, most: int | None = None
-) -> Candidates:
-    """Return the first palm poses of an object, see `Drawing`."""
-    return Drawing(model, X_TO, config).candidates(most)
 
 
 def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) -> None:
@@ -273,10 +232,11 @@ def sampler_class(method: str, config: CandidateConfig) -> Callable[..., Sampler
         ConfigError: If it cannot be imported or has another signature.
     """
     if is_own_class(method):
-        return own_sampler(method, config.code)
+        key = "candidates.method"
+        return own_class(method, config.code, key=key, arguments=ARGUMENTS, method="poses")
     found: Callable[..., Sampler] = registry.find("samplers", method)
-    if method not in OURS and not registry.accepts(found, ARGUMENTS[:-1]):
-        raise ConfigError(f"{method}: must take (model, X_TO, stream), got other arguments")
+    if not registry.accepts(found, ARGUMENTS):
+        raise ConfigError(f"{method}: must take ({', '.join(ARGUMENTS)}), got other arguments")
     return found
 
 
@@ -287,33 +247,31 @@ def refuse_samplers(config: Config) -> None:
         ConfigError: See `sampler_class`.
         HandError: If the sampler `closing` cannot close the hand.
     """
-    for method in config.candidates.methods:
+    for method in config.candidates.method:
         sampler_class(method, config.candidates)
     hand = load_hand(config.hand_source)
-    if "closing" in config.candidates.methods and not all(map(has_paths, hand.preshapes or [hand])):
+    if "closing" in config.candidates.method and not all(map(has_paths, hand.preshapes or [hand])):
         raise HandError(
             "hand must be one whose fingers share no link for the sampler closing, got "
             f"{hand.name}; candidates.method=normals takes any hand"
         )
 
 
-def found_sampler(
-    method: str, config: Config, model: ObjectModel, X_TO: Array, stream: Stream
-) -> Sampler:
-    """Return the sampler of a name at a resting pose X_TO (4, 4).
-
-    A class takes the model, X_TO and the stream, and one of the package, if it wants to, the
-    configuration.
+def _palms(
+    method: str, resting: int, model: ObjectModel, X_TO: Array, config: Config
+) -> Iterator[Palm | None]:
+    """Return the palms of a sampler at a resting pose of an object, its index and X_TO (4, 4).
 
     Raises:
         ConfigError: If a user-defined sampler cannot be run.
         HandError: If the sampler cannot be used with the hand.
     """
     found = sampler_class(method, config.candidates)
+    arguments = model, X_TO, _sampler_stream(model.name, config.seed, resting, method), config
     if _source(method) is not Source.OWN:
-        wants = (config,) if registry.accepts(found, ARGUMENTS) else ()
-        return found(model, X_TO, stream, *wants)
-    return OwnPoses(method, found, model, X_TO, stream, load_hand(config.hand_source))
+        return found(*arguments).poses()
+    sampler = run_own(method, found, *arguments)
+    return checked_poses(method, sampler, load_hand(config.hand_source))
 
 
 def _source(method: str) -> Source:
@@ -334,14 +292,13 @@ def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
 
 
 def _turns(
-    places: Sequence[Place], samplers: Mapping[Place, Sampler]
+    places: Sequence[Place], palms: Mapping[Place, Iterator[Palm | None]]
 ) -> Iterator[tuple[Place, Palm]]:
     """Yield a palm of each place in turn, until no sampler yields another one.
 
     A place whose palms become nearer to each other waits until those of all others are as near.
     """
-    palms = {place: sampler.poses() for place, sampler in samplers.items()}
-    waits, left = dict.fromkeys(samplers, 0), list(places)
+    waits, left = dict.fromkeys(palms, 0), list(places)
     while left:
         first = min(waits[place] for place in left)
         for place in [place for place in left if waits[place] == first]:

@@ -27,6 +27,7 @@ from pydrake.multibody.plant import HydroelasticContactInfo
 from pydrake.multibody.tree import BodyIndex
 
 from drakegrasp.arithmetic import dot, multiply, norm
+from drakegrasp.config import CloseConfig
 from drakegrasp.frames import X_WT, Array, invert_pose, rotate_vectors, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import posed_links
@@ -120,17 +121,17 @@ def forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
 
 
 def open_hand_collides(scene: Scene) -> bool:
-    """Return whether a part of the hand intersects object or table, or is inside the object.
+    """Return whether a part of the hand intersects object or table, or is inside the object."""
+    return bool(_meetings_of_hand(scene)) or is_inside(scene, _points_in_parts(scene))
+
+
+def open_hand_meets(scene: Scene) -> dict[str, list[str]]:
+    """Return the links of the hand that intersect the object and the table, under these keys.
 
     This is a geometry query without a contact solve. Drake returns contact surfaces if surfaces
     intersect. A part that is completely inside the object has no contact surface, so a point inside
     each part is also tested against the object's volume.
     """
-    return bool(_meetings_of_hand(scene)) or is_inside(scene, _points_in_parts(scene))
-
-
-def open_hand_meets(scene: Scene) -> dict[str, list[str]]:
-    """Return the links of the hand that intersect the object and the table, under these keys."""
     names = {scene.object.index(): "object", scene.table.index(): "table"}
     found: dict[str, set[str]] = {name: set() for name in names.values()}
     hand, plant = hand_bodies(scene), scene.plant
@@ -345,21 +346,27 @@ STEP = 0.02
 
 
 class Way:
-    """The observed states of a hand in one attempt."""
+    """The observed states of a hand in one attempt; none if the clearance is not measured."""
 
-    def __init__(self) -> None:
+    def __init__(self, rules: CloseConfig) -> None:
+        self._measures = rules.scrape_depth is not None
         self._states: list[Array] = []
         self._scene: Scene | None = None
 
     def look(self, scene: Scene) -> None:
         """Add the present state of the scene; all scenes must have the same hand."""
-        X_TG = multiply(invert_pose(X_WT), palm_pose(scene))
-        self._states.append(np.concatenate([X_TG[2], hand_positions(scene)]))
-        self._scene = scene
+        if self._measures:
+            X_TG = multiply(invert_pose(X_WT), palm_pose(scene))
+            self._states.append(np.concatenate([X_TG[2], hand_positions(scene)]))
+            self._scene = scene
 
     def clearance(self) -> float:
-        """Return the smallest height of the hand above the table's top [m]; negative below it."""
-        assert self._scene is not None
+        """Return the smallest height of the hand above the table's top [m]; negative below it.
+
+        It is NaN if it is not measured.
+        """
+        if self._scene is None:
+            return np.nan
         states = _between(np.array(self._states))
         names = hand_joint_names(self._scene)
         return least_height(self._scene.hand, names, states[:, 4:], states[:, :4])

@@ -113,9 +113,8 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     # `scene` takes fine steps; `current` is the scene that takes the steps that are needed now.
     now, current, monitor, used = start, scene, _Monitor(scene), [scene]
     slip_released, turn_released, certain, moved = 0.0, 0.0, False, False
-    way = Way() if config.close.scrape_depth is not None else None
-    if way is not None:
-        way.look(scene)
+    way = Way(config.close)
+    way.look(scene)
     try:
         # Free the object in the hand; later the wrist moves to its target.
         release(scene)
@@ -132,8 +131,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             limits.advance(current, check - margin - current.time)
             certain = monitor.update(current, check - now, config.close.stop_speed)
             now = check
-            if way is not None:
-                way.look(current)
+            way.look(current)
 
             # Measure how far the object moved in the hand, in total and before the wrist moves.
             X_GO = _object_in_hand(current)
@@ -169,7 +167,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         slip_released=slip_released,
         turn_released=turn_released,
         moved=moved,
-        clearance=np.nan if way is None else way.clearance(),
+        clearance=way.clearance(),
     )
 
 

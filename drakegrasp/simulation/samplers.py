@@ -12,7 +12,7 @@ hand. Both are checked; docs/how-to/own-sampler.md has an example.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from functools import lru_cache
 from itertools import count
 from numbers import Real
@@ -27,8 +27,7 @@ from drakegrasp.errors import ConfigError, GraspError, listed
 from drakegrasp.frames import Array, read_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits
-from drakegrasp.objects.model import ObjectModel
-from drakegrasp.registry import own_class, run_own
+from drakegrasp.registry import run_own
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.palms import Shape
 
@@ -62,28 +61,24 @@ def rotation_candidates(
     X_TO: Array,
     config: CandidateConfig,
     stream: Stream,
-) -> tuple[Array, int, int]:
-    """Return the distinct valid poses of the paper's method, and two counts.
+) -> Array:
+    """Return the distinct valid poses (n, 4, 4) of the paper's method.
 
     X_OG = R_global X_OG0 R_local, with R = Rx Ry Rz each. X_OG0 is on +Oz, as far from the box's
     centre as its corner, and looks at it (Veres et al., equation 1). A pose is valid if the palm's
-    origin is above the table and the ray along +Gz meets the box, edges included.
+    origin is above the table and the ray along +Gz meets the box, edges included. The poses are
+    sorted as rounded integers by the entries of their rotations, row by row, and then by position.
 
     Args:
         half_extents: (3,), half extents of the box about the origin of {O} [m].
         X_TO: Resting pose (4, 4).
         config: The rotations; with `jitter_deg`, each angle gets a random addition.
         stream: Draws the jitter.
-
-    Returns:
-        Poses (n, 4, 4), sorted as rounded integers by the entries of their rotations, row by row,
-        and then by position; the number of combinations; the number of valid combinations.
     """
     half, radius = np.asarray(half_extents, dtype=float), float(norm(half_extents))
     axes_global = (config.global_x_deg, config.global_y_deg, config.global_z_deg)
     axes_local = (config.local_x_deg, config.local_y_deg, config.local_z_deg)
     grids = _angle_grid(axes_global), _angle_grid(axes_local)
-    combinations = len(grids[0]) * len(grids[1])
 
     # With jitter, the poses are drawn: compare the valid ones and keep the first of equal ones.
     if config.jitter_deg:
@@ -96,11 +91,11 @@ def rotation_candidates(
             rotations.append(R_OG[hits])
             positions.append(p_OG[keep[hits]])
         R, p = np.concatenate(rotations), np.concatenate(positions)
-        first, _ = _distinct(_words(R, p / radius), np.ones(len(R), dtype=np.int64))
-        return make_poses(R[first], p[first]), combinations, len(R)
+        first = _distinct(_words(R, p / radius))
+        return make_poses(R[first], p[first])
 
     # Without jitter, equal poses are equally valid: test only the first of each set.
-    numbers, members = _distinct_combinations(axes_global, axes_local)
+    numbers = _distinct_combinations(axes_global, axes_local)
     R_global, R_local = map(_rotation_xyz, grids)
     p_OG, R_first = radius * R_global[:, :, 2], R_global * np.diag(R_OG0)
     i, j = np.divmod(numbers, len(R_local))
@@ -108,8 +103,7 @@ def rotation_candidates(
     z_O = dot(R_first[i[keep]], R_local[j[keep], None, :, 2])
     keep = keep[ray_meets_box(p_OG[i[keep]], z_O, half)]
     i, j = i[keep], j[keep]
-    poses = make_poses(multiply(R_first[i], R_local[j]), p_OG[i])
-    return poses, combinations, int(members[keep].sum())
+    return make_poses(multiply(R_first[i], R_local[j]), p_OG[i])
 
 
 def make_poses(R: Array, p: Array) -> Array:
@@ -143,8 +137,8 @@ def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]
 
 
 @lru_cache(maxsize=1)
-def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> tuple[Numbers, Numbers]:
-    """Return the first combination (n,) of each distinct pose, and its number of combinations (n,).
+def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> Numbers:
+    """Return the first combination (n,) of each distinct pose.
 
     Combination i m + j consists of the global rotation i and the local rotation j of m. The poses
     are in the order of `rotation_candidates`.
@@ -152,22 +146,19 @@ def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> tuple[Numbers, 
     # Compare the poses of each chunk first, so that fewer poses are left to compare.
     R_global, R_local = (_rotation_xyz(_angle_grid(axes)) for axes in (global_deg, local_deg))
     total = len(R_global) * len(R_local)
-    words, numbers, counts = [], [], []
+    words, numbers = [], []
     for start in range(0, total, CHUNK):
         i, j = np.divmod(np.arange(start, min(start + CHUNK, total)), len(R_local))
         R_OG = multiply(R_global[i] * np.diag(R_OG0), R_local[j])
         key = _words(R_OG, R_global[i, :, 2])
-        first, count = _distinct(key, np.ones(len(key), dtype=np.int64))
+        first = _distinct(key)
         words.append(key[first])
         numbers.append(start + first)
-        counts.append(count)
 
     # Compare the poses of all chunks; the earliest of equal poses is the first.
-    first, members = _distinct(np.concatenate(words), np.concatenate(counts))
-    number = np.concatenate(numbers)[first]
-    for array in (number, members):
-        array.setflags(write=False)
-    return number, members
+    number = np.concatenate(numbers)[_distinct(np.concatenate(words))]
+    number.setflags(write=False)
+    return number
 
 
 def _words(R: Array, p: Array) -> Numbers:
@@ -182,17 +173,12 @@ def _words(R: Array, p: Array) -> Numbers:
     return np.asarray((a << 2 * BITS) | (b << BITS) | c)
 
 
-def _distinct(words: Numbers, weights: Numbers) -> tuple[Numbers, Numbers]:
-    """Return the first row (k,) of each set of equal rows, sorted, and its sum of weights (k,).
-
-    Args:
-        words: (n, 4), the rows.
-        weights: (n,), weight of each row.
-    """
+def _distinct(words: Numbers) -> Numbers:
+    """Return the first row (k,) of each set of equal rows (n, 4), sorted."""
     order = np.lexsort(words.T[::-1])
     new = np.ones(len(order), dtype=np.bool_)
     new[1:] = (words[order[1:]] != words[order[:-1]]).any(axis=1)
-    return order[new], np.add.reduceat(weights[order], np.flatnonzero(new))
+    return order[new]
 
 
 def _jittered(
@@ -227,62 +213,28 @@ def _rotation_xyz(angles_deg: Array) -> Array:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def own_sampler(stored: str, code: Mapping[str, str]) -> type[Any]:
-    """Return the class of a user-defined sampler.
+def checked_poses(method: str, sampler: Any, hand: Hand) -> Iterator[Array | tuple[Array, Shape]]:
+    """Yield the palm poses of a sampler of the user or of another package, after checking them.
+
+    Args:
+        method: Name of the sampler in the configuration.
+        sampler: The sampler.
+        hand: The hand, to whose preshapes and limits the shapes are compared.
 
     Raises:
-        ConfigError: If the class cannot be imported or has another signature.
+        ConfigError: If the sampler cannot be run, or yields something other than poses and shapes
+            of the hand.
     """
-    key, arguments = "candidates.method", ("model", "X_TO", "stream")
-    return own_class(stored, code, key=key, arguments=arguments, method="poses")
-
-
-class OwnPoses:
-    """The palms that a user-defined sampler yields, in their order."""
-
-    def __init__(
-        self,
-        stored: str,
-        found: Callable[[ObjectModel, Array, Stream], Any],
-        model: ObjectModel,
-        X_TO: Array,
-        stream: Stream,
-        hand: Hand,
-    ) -> None:
-        """Make the sampler.
-
-        Args:
-            stored: Name of the sampler in the configuration.
-            found: The class.
-            model: The object.
-            X_TO: Resting pose of the object, (4, 4).
-            stream: Random numbers of the sampler.
-            hand: The hand, to whose preshapes and limits the shapes are compared.
-
-        Raises:
-            ConfigError: If the sampler cannot be run.
-        """
-        self._stored, self._hand = stored, hand
-        self._sampler = run_own(stored, found, model, X_TO, stream)
-
-    def poses(self) -> Iterator[Array | tuple[Array, Shape]]:
-        """Yield the palm poses, alone or with the shape of the hand.
-
-        Raises:
-            ConfigError: If the sampler cannot be run, or yields something other than poses and
-                shapes of the hand.
-        """
-        name = self._stored.partition("@")[0]
-        palms = run_own(self._stored, lambda: iter(self._sampler.poses()))
-        for i in count():
-            palm = run_own(self._stored, next, palms, None)
-            if palm is None:
-                return
-            where = f"{name}: pose {i}"
-            if isinstance(palm, tuple) and len(palm) == 2:
-                yield _pose(where, palm[0]), _shape(where, palm[1], self._hand)
-            else:
-                yield _pose(where, palm)
+    palms = run_own(method, lambda: iter(sampler.poses()))
+    for i in count():
+        palm = run_own(method, next, palms, None)
+        if palm is None:
+            return
+        where = f"{method.partition('@')[0]}: pose {i}"
+        if isinstance(palm, tuple) and len(palm) == 2:
+            yield _pose(where, palm[0]), _shape(where, palm[1], hand)
+        else:
+            yield _pose(where, palm)
 
 
 def _pose(name: str, X_OG: npt.ArrayLike) -> Array:

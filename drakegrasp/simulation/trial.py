@@ -135,69 +135,20 @@ def run_attempt(
         OSError: If a file of the hand cannot be read.
     """
     drive_of(scene.hand, config.lift)
-    scene, path = _scene_for(scene, attempt), attempt.path
-    required = scene.hand.required
+    scene = _scene_for(scene, attempt)
     X_TO = np.asarray(X_TO, dtype=float)
-    start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
-    X_WO = multiply(X_WT, X_TO)
-    X_WG = multiply(X_WO, attempt.X_OG)
+    start = TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG)
     try:
-        # Screen: do not simulate an attempt that geometry alone decides.
-        if not attempt.ray_hits:
-            return start
-        if multiply(X_TO, attempt.X_OG)[2, 3] <= 0.0:
-            return replace(start, outcome=Outcome.BELOW_TABLE)
         if prediction is None:
-            prediction = _predict(scene, X_TO, attempt, config)
-        screened = None if prediction is None else prediction.outcome
-        # If the open hand is close to a collision, Drake decides below whether it collides.
-        near = prediction is not None and not prediction.clear
-        if screened is Outcome.START_COLLISION or (screened is not None and not near):
-            return replace(start, outcome=screened)
-
-        # Place: object and palm do not move, the fingers are at the start of the attempt.
+            (prediction,) = predict(scene.model, scene.hand, X_TO, [attempt], config.screen)
+        decided = _start(scene, X_TO, attempt, prediction)
+        if decided is not None:
+            return replace(start, outcome=decided)
         limits = start_limits(config)
-        set_materials(scene, _materials(scene, attempt))
-        q = None if path is None else path[0]
-        reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing, q=q)
-        if open_hand_collides(scene):
-            return replace(start, outcome=Outcome.START_COLLISION)
-        if screened is not None:
-            return replace(start, outcome=screened)
-
-        # Close: start just before the fingers meet something, if geometry has found where.
-        way = Way() if config.close.scrape_depth is not None else None
-        if way is not None:
-            way.look(scene)
-        if prediction is not None:
-            reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
-            if way is not None:
-                way.look(scene)
-        if path is not None and attempt.own_motors:
-            _follow_path(scene, limits, config, path, way)
-        else:
-            _close(scene, limits, config, prediction, way)
-        contacts = read_contacts(scene)
-        closed = Closed(
-            contacts=contacts,
-            q=hand_positions(scene),
-            duration=scene.time,
-            clearance=np.nan if way is None else way.clearance(),
-        )
-        record = replace(start, closed=closed)
-
-        # Judge the closed hand: it lifts only an object held by all fingertips and nothing else.
-        verdict = judge_closed(
-            contacts.touching,
-            contacts.other_links,
-            contacts.hand_on_table,
-            required=required,
-            scraped=scrapes(closed.clearance, config.close),
-        )
-        if verdict != Outcome.SUCCESS:
-            return replace(record, outcome=Outcome(int(verdict)))
-
-        return _lift_closed(scene, record, config, limits)
+        record = _close(scene, start, attempt, config, limits, prediction)
+        if record.outcome is not Outcome.SUCCESS:
+            return record
+        return _lift(scene, record, config, limits)
     except TrialTimeout:
         return replace(start, outcome=Outcome.TIMEOUT)
     except (MemoryError, OSError):
@@ -205,36 +156,6 @@ def run_attempt(
     # A failed assertion in Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
         return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
-
-
-def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
-    """Return the scene with the motors of an attempt."""
-    if attempt.own_motors and scene.own_motors is not None:
-        return scene.own_motors()
-    return scene
-
-
-def _lift_closed(
-    scene: Scene, record: TrialRecord, config: Config, limits: TrialLimits
-) -> TrialRecord:
-    """Run an attempt whose closed hand may lift up to its verdict, and return its record."""
-    # Lift: object and wrist are free, and the wrist moves to its target.
-    end = lift(scene, limits, config)
-    record = replace(record, lift=end)
-
-    # Judge the lifted object: all fingertips must still hold it, clear of the table. A lift that
-    # ended because the object moved has no such verdict.
-    if end.moved:
-        return replace(record, outcome=Outcome.MOVED)
-    contacts = end.contacts
-    verdict = judge_lifted(
-        contacts.touching,
-        contacts.other_links,
-        contacts.object_on_table,
-        required=scene.hand.required,
-        scraped=scrapes(end.clearance, config.close),
-    )
-    return replace(record, outcome=Outcome(int(verdict)))
 
 
 def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, list[str]]:
@@ -245,15 +166,44 @@ def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, lis
         X_TO: Resting pose of the object, (4, 4).
         attempt: The attempt.
     """
-    scene, X_WO = _scene_for(scene, attempt), multiply(X_WT, X_TO)
-    q, X_WG = None if attempt.path is None else attempt.path[0], multiply(X_WO, attempt.X_OG)
-    reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing, q=q)
+    scene = _scene_for(scene, attempt)
+    _place(scene, X_TO, attempt, attempt.closing)
     return open_hand_meets(scene)
 
 
-def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
-    (prediction,) = predict(scene.model, scene.hand, X_TO, [attempt], config.screen)
-    return prediction
+def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
+    """Return the scene with the motors of an attempt."""
+    if attempt.own_motors and scene.own_motors is not None:
+        return scene.own_motors()
+    return scene
+
+
+def _place(scene: Scene, X_TO: Array, attempt: Attempt, closing: Array | None) -> None:
+    """Reset a scene to the start of an attempt, with closing positions (k,) [rad or m]."""
+    X_WO, q = multiply(X_WT, X_TO), None if attempt.path is None else attempt.path[0]
+    X_WG = multiply(X_WO, attempt.X_OG)
+    reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=closing, q=q)
+
+
+def _start(
+    scene: Scene, X_TO: Array, attempt: Attempt, prediction: Prediction | None
+) -> Outcome | None:
+    """Place the open hand, and return the outcome of an attempt that its start decides."""
+    # Do not simulate an attempt that geometry alone decides.
+    if not attempt.ray_hits:
+        return Outcome.RAY_MISS
+    if multiply(X_TO, attempt.X_OG)[2, 3] <= 0.0:
+        return Outcome.BELOW_TABLE
+    screened = None if prediction is None else prediction.outcome
+    if screened is Outcome.START_COLLISION:
+        return screened
+    if prediction is not None and screened is not None and prediction.clear:
+        return screened
+
+    # If the open hand is close to a collision, Drake decides whether it collides.
+    set_materials(scene, _materials(scene, attempt))
+    _place(scene, X_TO, attempt, attempt.closing)
+    return Outcome.START_COLLISION if open_hand_collides(scene) else screened
 
 
 def _materials(scene: Scene, attempt: Attempt) -> Materials:
@@ -265,10 +215,66 @@ def _materials(scene: Scene, attempt: Attempt) -> Materials:
 
 def _close(
     scene: Scene,
+    start: TrialRecord,
+    attempt: Attempt,
+    config: Config,
+    limits: TrialLimits,
+    prediction: Prediction | None,
+) -> TrialRecord:
+    """Close the hand on the static object, and return the record; a success may lift."""
+    # Start just before the fingers meet something, if geometry has found where.
+    way = Way(config.close)
+    way.look(scene)
+    if prediction is not None:
+        _place(scene, start.X_TO, attempt, prediction.closing)
+        way.look(scene)
+    if attempt.path is not None and attempt.own_motors:
+        _follow_path(scene, limits, config, attempt.path, way)
+    else:
+        _close_fingers(scene, limits, config, prediction, way)
+    closed = Closed(
+        contacts=read_contacts(scene),
+        q=hand_positions(scene),
+        duration=scene.time,
+        clearance=way.clearance(),
+    )
+
+    # It lifts only an object that is held by all fingertips and nothing else.
+    verdict = judge_closed(
+        closed.contacts.touching,
+        closed.contacts.other_links,
+        closed.contacts.hand_on_table,
+        required=scene.hand.required,
+        scraped=scrapes(closed.clearance, config.close),
+    )
+    return replace(start, closed=closed, outcome=Outcome(int(verdict)))
+
+
+def _lift(scene: Scene, record: TrialRecord, config: Config, limits: TrialLimits) -> TrialRecord:
+    """Lift the object in the closed hand, and return the record."""
+    end = lift(scene, limits, config)
+    record = replace(record, lift=end)
+
+    # All fingertips must still hold the object, clear of the table. A lift that ended because the
+    # object moved has no such verdict.
+    if end.moved:
+        return replace(record, outcome=Outcome.MOVED)
+    verdict = judge_lifted(
+        end.contacts.touching,
+        end.contacts.other_links,
+        end.contacts.object_on_table,
+        required=scene.hand.required,
+        scraped=scrapes(end.clearance, config.close),
+    )
+    return replace(record, outcome=Outcome(int(verdict)))
+
+
+def _close_fingers(
+    scene: Scene,
     limits: TrialLimits,
     config: Config,
     prediction: Prediction | None,
-    way: Way | None,
+    way: Way,
 ) -> None:
     """Close the fingers on the static object until they stop or a required finger has missed it."""
     # Closing that geometry skipped counts as time; an angle beyond the last contact is a miss.
@@ -282,17 +288,14 @@ def _close(
     # The last check may be before the end by a rounding error, but never by a step.
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(config.close.check_period, end - scene.time))
-        if way is not None:
-            way.look(scene)
+        way.look(scene)
         stopped = finger_speed(scene) < config.close.stop_speed
         closing = multiply(scene.hand.closing_ratio, closing_angles(scene))
         if stopped or np.any(closing > last):
             break
 
 
-def _follow_path(
-    scene: Scene, limits: TrialLimits, config: Config, path: Array, way: Way | None
-) -> None:
+def _follow_path(scene: Scene, limits: TrialLimits, config: Config, path: Array, way: Way) -> None:
     """Move each joint by its own motor to the grasp and on to the squeeze, until all have stopped.
 
     The joints move in synchrony: the joint with the longest path moves at the hand's closing speed.
@@ -311,7 +314,6 @@ def _follow_path(
     end = float(times[-1]) + config.close.max_time
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(config.close.check_period, end - scene.time))
-        if way is not None:
-            way.look(scene)
+        way.look(scene)
         if scene.time > times[-1] and finger_speed(scene) < config.close.stop_speed:
             break

@@ -24,7 +24,9 @@ from drakegrasp.errors import GraspError, HandError, listed
 from drakegrasp.frames import (
     Array,
     as_numbers,
+    frame_in_object,
     read_pose,
+    refuse_other_frames,
     rotate_vectors,
     transform_points,
     unpack_pose,
@@ -37,7 +39,6 @@ from drakegrasp.simulation.attempts import (
     UNTOLD,
     Attempts,
     GraspRows,
-    frame_in_object,
     misfits,
     read_confidence,
 )
@@ -430,8 +431,7 @@ def _camera_poses(frame: str, X_TC: npt.ArrayLike | None, count: int) -> Array |
         GraspError: If the frame is unknown, or the camera's pose is missing, is given for another
             frame, or is not one per grasp.
     """
-    if frame not in FRAMES:
-        raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
+    refuse_other_frames(frame, FRAMES)
     if X_TC is None:
         if frame == "camera":
             raise GraspError(

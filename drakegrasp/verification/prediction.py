@@ -8,18 +8,18 @@ grasps at all is an error, with a message of one line.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import LARGEST
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import FARTHEST, Array, as_numbers, without_torch
+from drakegrasp.frames import FARTHEST, Array, Frame, as_numbers, without_torch
 from drakegrasp.simulation.attempts import GraspRows
 
-Frame = Literal["object", "camera", "table", "mesh"]
-FRAMES: tuple[str, ...] = get_args(Frame)
+#: Frames of predicted contacts.
+FRAMES = (Frame.OBJECT, Frame.CAMERA, Frame.TABLE, Frame.MESH)
 #: A normal whose length differs from one by more than this is reported as normalised.
 NORMAL_TOLERANCE = 0.01
 #: Length below which a normal has no direction.

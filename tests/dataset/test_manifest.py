@@ -58,9 +58,6 @@ ENTRIES = """ "objects": [
     }
    ],
    "candidates": 7,
-   "combinations": 40,
-   "valid": 20,
-   "distinct": 10,
    "notes": [
     "2 holes closed"
    ]
@@ -94,9 +91,6 @@ MUG = ObjectEntry(
         ),
     ),
     candidates=7,
-    combinations=40,
-    valid=20,
-    distinct=10,
     notes=("2 holes closed",),
 )
 SHEET = RefusedMesh(name="2_sheet", mesh_sha256="cd", reason="must be closed")

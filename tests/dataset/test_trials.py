@@ -145,7 +145,7 @@ def test_row_or_column_that_is_not_there_is_refused(sound: Path) -> None:
         trials["mug"]
 
 
-@pytest.mark.parametrize("frame", ["O", "T", "G", "W"])
+@pytest.mark.parametrize("frame", ["object", "table", "palm", "world"])
 @pytest.mark.parametrize("when", ["closed", "lifted"])
 def test_contacts_are_those_of_the_file_in_any_frame(sound: Path, when: Any, frame: Any) -> None:
     trials = Trials(sound).where(outcome="success")
@@ -154,7 +154,8 @@ def test_contacts_are_those_of_the_file_in_any_frame(sound: Path, when: Any, fra
     for k, row in enumerate(trials.trial_ids):
         suffix = "_lifted" if when == "lifted" else ""
         X_TO, X_OG = (unpack_pose(stored(sound, f"{n}{suffix}")[row]) for n in ("X_TO", "X_OG"))
-        X_FO = {"O": np.eye(4), "T": X_TO, "G": invert_pose(X_OG), "W": X_WT @ X_TO}[frame]
+        in_world, in_palm = X_WT @ X_TO, invert_pose(X_OG)
+        X_FO = {"object": np.eye(4), "table": X_TO, "palm": in_palm, "world": in_world}[frame]
         p_OQ, nhat_Q_O, f_Q_O = (
             stored(sound, f"{when}_{name}")[row] for name in ("p_OQ", "nhat_Q_O", "f_Q_O")
         )
@@ -166,8 +167,8 @@ def test_contacts_are_those_of_the_file_in_any_frame(sound: Path, when: Any, fra
 def test_contacts_of_another_moment_or_frame_are_refused(sound: Path) -> None:
     with pytest.raises(DataError, match="when must be closed or lifted, got 'open'"):
         Trials(sound).contacts("open")  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="frame must be O, T, G or W, got 'C'"):
-        Trials(sound).contacts(frame="C")  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=r"frame must be one of object, table, .* got 'camera'"):
+        Trials(sound).contacts(frame="camera")
 
 
 def test_data_frame_has_a_row_per_attempt(sound: Path) -> None:

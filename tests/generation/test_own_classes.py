@@ -35,7 +35,7 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.candidates import Candidates, palm_attempts, sample_candidates
+from drakegrasp.simulation.candidates import Candidates, Drawing, palm_attempts
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own-sampler.md"
 
@@ -47,10 +47,10 @@ WRONG_SAMPLERS = {
     "no class but a value": ("Mine = 3", r"mine\.py: must have a class Mine, got none"),
     "constructor": (
         "class Mine:\n  def __init__(self, model): pass\n  def poses(self): yield",
-        r"mine\.py:Mine: must take \(model, X_TO, stream\), got other arguments",
+        r"mine\.py:Mine: must take \(model, X_TO, stream, config\), got other arguments",
     ),
     "no method": (
-        "class Mine:\n  def __init__(self, model, X_TO, stream): pass",
+        "class Mine:\n  def __init__(self, model, X_TO, stream, config): pass",
         r"mine\.py:Mine: must have a method poses\(self\), got none like it",
     ),
 }
@@ -131,7 +131,7 @@ def sampler(text: str, hand: str = "barrett") -> Config:
 def draw(box: ObjectModel, config: Config, count: int = 20) -> Candidates:
     X_TO = np.eye(4)
     X_TO[2, 3] = box.half_extents[2]
-    return sample_candidates(box, X_TO, config, count)
+    return Drawing(box, X_TO, config).candidates(count)
 
 
 def test_the_sampler_of_the_page_looks_at_the_object(own: Path, box: ObjectModel) -> None:
@@ -165,7 +165,7 @@ def test_a_changed_file_is_another_dataset_wherever_it_lies(own: Path) -> None:
     (own / "my_sampler.py").rename(own / "folder" / "my_sampler.py")
     moved = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])
     assert moved.simulation_hash() == config.simulation_hash()
-    assert re.fullmatch(r"my_sampler\.py:Ring@[0-9a-f]{16}", str(config.candidates.method))
+    assert re.fullmatch(r"my_sampler\.py:Ring@[0-9a-f]{16}", config.candidates.method[0])
     with (own / "folder" / "my_sampler.py").open("a") as file:
         file.write("# changed\n")
     changed = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])

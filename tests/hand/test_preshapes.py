@@ -100,9 +100,6 @@ def test_preshapes_are_drawn_after_the_spreads() -> None:
         source=np.zeros(count, dtype=np.int64),
         spread=np.full(count, np.nan),
         preshape_index=np.full(count, -1),
-        combinations=count,
-        valid=count,
-        distinct=count,
     )
     rules = CandidateConfig(standoffs=(0.05, 0.07), spreads_deg=(0.0, 10.0, 20.0))
 

@@ -228,9 +228,6 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
         source=np.zeros(4, dtype=np.int64),
         spread=np.full(4, np.nan),
         preshape_index=np.full(4, -1),
-        combinations=4,
-        valid=4,
-        distinct=4,
     )
     return PreparedObject(
         model=model,

@@ -28,7 +28,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
-from drakegrasp.simulation.candidates import normal_candidates, palm_attempts, sample_candidates
+from drakegrasp.simulation.candidates import Drawing, normal_candidates, palm_attempts
 from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.simulation.palms import palm_motion
 from drakegrasp.simulation.robustness import PALM_SHIFT, PALM_TURN, _noise_factor
@@ -84,7 +84,6 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     round_base = source.name == "2_cylinder"
     yield "X_TO", digest(np.round(prepared.X_TO[2], 4) + 0.0 if round_base else prepared.X_TO)
     yield "palm poses", digest(candidates.X_OG, candidates.distance)
-    yield "counts", f"{candidates.combinations} {candidates.valid} {candidates.distinct}"
     yield (
         "attempts",
         digest(
@@ -100,7 +99,7 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     yield "conditions", digest(*(np.array([d[name] for d in drawn]) for name in drawn[0]))
     yield "normals", digest(normal_candidates(model, 1000, Stream(7)))
     X_TO = make_pose(R_TO, [0.1, 0.2, model.half_extents[2]])
-    closing = sample_candidates(model, X_TO, load_config("fast"), CLOSING)
+    closing = Drawing(model, X_TO, load_config("fast")).candidates(CLOSING)
     yield "closing", digest(closing.X_OG, closing.spread)
     predictions = predict(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
     yield (
@@ -126,7 +125,7 @@ def main(meshes: Path | None) -> dict[str, object]:
     half = np.array([0.03, 0.04, 0.05])
     X_TO = np.eye(4)
     X_TO[2, 3] = half[2]
-    poses, *_ = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
+    poses = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
     found["jittered palm poses"] = digest(poses)
     names = [f"{i}_thing" for i in range(12)]
     homes = find_homes(names, {}, SplitConfig(seed=7))

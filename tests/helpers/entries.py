@@ -21,9 +21,6 @@ def object_entry(name: str, **changes: Any) -> ObjectEntry:
         collision_error=0.0,
         resting=(),
         candidates=1,
-        combinations=1,
-        valid=1,
-        distinct=1,
         notes=(),
     )
     return ObjectEntry(**{**values, **changes})

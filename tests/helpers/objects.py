@@ -14,7 +14,7 @@ from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.candidates import palm_attempts, sample_candidates
+from drakegrasp.simulation.candidates import Drawing, palm_attempts
 from drakegrasp.simulation.samplers import R_OG0
 
 #: Edge of the cube that the hand can grasp from above [m].
@@ -49,7 +49,7 @@ def drawn_attempts(
     model: ObjectModel, X_TO: npt.NDArray[np.float64], config: Config
 ) -> Iterator[Attempt]:
     """Yield all attempts that a build draws for an object: a test takes as many as it needs."""
-    candidates = sample_candidates(model, X_TO, config)
+    candidates = Drawing(model, X_TO, config).candidates()
     every, rules = range(len(candidates)), config.candidates
     return palm_attempts(candidates, every, rules, name=model.name, seed=config.seed)
 
@@ -78,7 +78,7 @@ def write_above(folder: Path, standoff: float, x: float = 0.0) -> str:
         "from drakegrasp.frames import make_pose\n"
         "from drakegrasp.simulation.samplers import R_OG0\n"
         "class Above:\n"
-        "  def __init__(self, model, X_TO, stream):\n"
+        "  def __init__(self, model, X_TO, stream, config):\n"
         f"    self.height = float(model.half_extents[2]) + {standoff}\n"
         "  def poses(self):\n"
         f"    yield make_pose(R_OG0, [{x}, 0.0, self.height])\n"

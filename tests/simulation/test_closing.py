@@ -106,12 +106,6 @@ def test_a_jaw_that_ends_before_the_object_has_a_gap(jaws: Hand) -> None:
     assert found["opposition"] == above["opposition"] == 0.0
 
 
-def test_three_fingers_balance_with_other_fractions_of_force() -> None:
-    """The Barrett Hand's thumb presses as much as both other fingers together."""
-    found = close_on(solid(box()), load_hand("barrett"), 0.0, down(z=0.14)[None])
-    assert found["touch"].all() and found["opposition"] > 0.9
-
-
 def test_jaws_with_one_motor_stop_together(shared: Hand) -> None:
     """2 mm beside the middle: the first jaw stops after 18 mm, and the other has 4 mm to go."""
     found = close_on(solid(box()), shared, 0.0, down(y=0.002)[None])

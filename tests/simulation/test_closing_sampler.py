@@ -25,7 +25,7 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.shapes import kitchen
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.candidates import Candidates, palm_attempts, sample_candidates
+from drakegrasp.simulation.candidates import Candidates, Drawing, palm_attempts
 
 #: Full extents of a tall box, which leaves all sides free [m].
 TALL = (0.05, 0.06, 0.16)
@@ -58,7 +58,7 @@ def standing(model: ObjectModel) -> Array:
 
 
 def draw(model: ObjectModel, most: int, config: Config | None = None) -> Candidates:
-    return sample_candidates(model, standing(model), config or closing(), most)
+    return Drawing(model, standing(model), config or closing()).candidates(most)
 
 
 def down(model: ObjectModel, drawn: Candidates) -> npt.NDArray[np.float64]:
@@ -109,10 +109,10 @@ def test_rounding_of_the_resting_pose_changes_no_bit(model: Callable[[str], Obje
         yaw = make_pose(rotation_about([0.0, 0.0, 1.0], turn), np.zeros(3))
         X_TO = tilt @ yaw @ standing(model("tall"))
         assert (standing(model("tall")) != X_TO).any()
-        assert_equal(sample_candidates(model("tall"), X_TO, closing(), 60), first)
+        assert_equal(Drawing(model("tall"), X_TO, closing()).candidates(60), first)
     # An object on its side has other palms.
     lying = make_pose([[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.0, 0.0, TALL[1] / 2])
-    other = sample_candidates(model("tall"), lying, closing(), 60)
+    other = Drawing(model("tall"), lying, closing()).candidates(60)
     assert (other.X_OG[:5] != first.X_OG[:5]).any()
 
 
@@ -156,11 +156,6 @@ def test_first_palms_are_distinct(model: Callable[[str], ObjectModel]) -> None:
     assert near.sum() == len(X)
 
 
-def test_low_things_are_taken_from_straight_above_too(model: Callable[[str], ObjectModel]) -> None:
-    found = down(model("low"), draw(model("low"), 60))
-    assert (found > 85.0).sum() >= 4
-
-
 def test_directions_take_turns(model: Callable[[str], ObjectModel]) -> None:
     """Around a tall box many directions are as good, and none comes again before all others."""
     cells = approach_cells(draw(model("tall"), 10).X_OG)
@@ -182,7 +177,7 @@ def test_palms_close_on_small_and_hollow_things(
 
 def test_where_nothing_closes_there_is_no_palm(model: Callable[[str], ObjectModel]) -> None:
     drawn = draw(model("plate"), 1000)
-    assert len(drawn) == drawn.combinations == 0
+    assert len(drawn) == 0
     # The other sampler goes on.
     config = load_config(overrides=["candidates.method=[closing, normals]"])
     assert set(draw(model("plate"), 5, config).source) == {Source.NORMALS}

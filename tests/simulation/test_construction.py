@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +22,10 @@ from drakegrasp.simulation.construction import (
     build_object_scene,
     build_scene,
     object_friction,
-    object_inertia,
     partner_friction,
 )
 from drakegrasp.simulation.scene import (
     Scene,
-    advance,
-    closing_angles,
-    closing_rates,
-    finger_speed,
     hand_joint_names,
     release,
     reset_attempt,
@@ -60,14 +54,6 @@ def test_plant_has_the_mass_properties_of_the_model(cone: ObjectModel, config: C
     about_com = M.Shift(M.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
     np.testing.assert_allclose(about_com, cone.I_OOcm_O, rtol=1e-9, atol=1e-12)
     assert np.abs(np.triu(cone.I_OOcm_O, 1)).max() > 1e-5
-
-
-def test_another_mass_scales_the_inertia_and_not_the_centre(cone: ObjectModel) -> None:
-    M = object_inertia(cone, 3.0 * cone.mass)
-    assert M.get_mass() == pytest.approx(3.0 * cone.mass)
-    np.testing.assert_allclose(M.get_com(), cone.p_OOcm, atol=1e-12)
-    about_com = M.Shift(M.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
-    np.testing.assert_allclose(about_com, 3.0 * cone.I_OOcm_O, rtol=1e-9, atol=1e-12)
 
 
 def properties(scene: Scene, body: RigidBody, group: str, name: str) -> list[object]:
@@ -125,20 +111,6 @@ def test_solver_and_step_are_the_configured_ones(
         expected = DiscreteContactApproximation.__members__[f"k{solver.capitalize()}"]
         assert plant.get_discrete_contact_approximation() == expected
         assert plant.time_step() == pytest.approx(step)
-
-
-def test_open_hand_closes_at_its_speed(
-    scene: Scene, cube: ObjectModel, config: Config, hand: Hand
-) -> None:
-    """In the air, where nothing stops a finger."""
-    X_WO = X_WT @ standing(cube)
-    reset_attempt(scene, X_WO, X_WO @ from_above(cube, 0.3).X_OG, spread=0.0)
-    advance(scene, 0.3)
-    expected = 0.3 * np.asarray(hand.closing_speed)
-    np.testing.assert_allclose(closing_angles(scene), expected, rtol=0.05)
-    unit = hand.closing_unit
-    np.testing.assert_allclose(closing_rates(scene), hand.closing_speed / unit, rtol=0.05)
-    assert finger_speed(scene) == pytest.approx(np.abs(closing_rates(scene)).max())
 
 
 def test_the_arm_carries_the_hand(scene: Scene, cube: ObjectModel, config: Config) -> None:
@@ -234,19 +206,6 @@ def test_hand_meets_the_collision_mesh_and_the_table_its_hull(
             "object::hand": len(ring.faces),
             "object::table": len(model.resting_surface.faces),
         }
-
-
-def test_positions_have_an_order_that_is_not_that_of_the_file(
-    tmp_path: Path, cube: ObjectModel, config: Config
-) -> None:
-    path = write_tongs(tmp_path)
-    model = tmp_path / "tongs.urdf"
-    joints = re.findall(r"  <joint .*?</joint>\n", model.read_text(), re.DOTALL)
-    text = re.sub(r"  <joint .*?</joint>\n", "", model.read_text(), flags=re.DOTALL)
-    model.write_text(text.replace("</robot>", "".join([*reversed(joints), "</robot>"])))
-    hand = load_hand(path)
-    names = hand_joint_names(build_scene(cube, config.physics, hand))
-    assert names == list(position_order(hand.model, hand.palm_link)) != list(hand.joint_names)
 
 
 def test_positions_are_in_the_order_of_a_tree_that_the_palm_is_the_root_of(

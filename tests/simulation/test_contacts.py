@@ -110,18 +110,6 @@ def _contact_in_link(scene: Scene, contacts: Contacts) -> float:
     return float(transform_points(X_FO, contacts.p_OQ[:1])[0, 0])
 
 
-def test_barretts_pad_is_the_front_of_its_fingertip(closed):
-    """It begins 18 mm along the link and has the round tip, but neither back nor sides.
-
-    Its band of 1 mm has the corners of the tip.
-    """
-    (finger, *_) = closed.hand.fingers
-    on = np.array([[0.04, 0.011, 0.0], [0.0171, 0.0, 0.01], [0.0593, -0.0044, 0.005]])
-    off = np.array([[0.0169, 0.01, 0.0], [0.03, -0.0021, 0.011], [0.059, -0.0046, 0.0]])
-    assert finger.on_pad(on).all()
-    assert not finger.on_pad(off).any()
-
-
 def test_weak_contacts_do_not_count(closed: Scene) -> None:
     """Fingertips press with some 10 N: a limit above that leaves nothing that touches."""
     forces = np.linalg.norm(read_contacts(closed).f_Q_O, axis=1)
@@ -131,22 +119,6 @@ def test_weak_contacts_do_not_count(closed: Scene) -> None:
         expected = [limit < forces.min()] * 3
         assert read_contacts(strict).touching.tolist() == expected
         assert bodies_on_object(strict) == (tips if expected[0] else set())
-
-
-def test_weak_contact_of_another_link_does_not_count(closed: Scene) -> None:
-    """All pads moved away: what the fingertips press with is then other links'."""
-    forces = np.linalg.norm(read_contacts(closed).f_Q_O, axis=1)
-    limit = float(forces[:2].mean() + forces[2]) / 2.0
-    strict = replace(closed, physics=closed.physics.model_copy(update={"contact_force": limit}))
-    assert with_pads(closed, NOWHERE, NOWHERE, NOWHERE).other_links == 3
-    assert (
-        with_pads(strict, NOWHERE, NOWHERE, NOWHERE).other_links
-        == (forces > limit).sum()
-        in (
-            1,
-            2,
-        )
-    )
 
 
 #: Two faces of a patch over an edge of the cube: the smaller one carries more.

@@ -126,20 +126,18 @@ def test_worm_lets_no_finger_open(
 
 
 @pytest.mark.sim
-def test_force_opens_fingers_without_a_worm(scene: Scene, cube: ObjectModel) -> None:
+@pytest.mark.parametrize(("drive", "force", "steps"), [("torque", 1.0, 40), ("locked", 5.0, 20)])
+def test_force_opens_fingers_without_a_worm_unless_they_are_locked(
+    scene: Scene, cube: ObjectModel, drive: str, force: float, steps: int
+) -> None:
     _closed_on(scene, cube)
-    engage(scene, "torque")
-    angles = _pushed(scene, FORCE, steps=40)
-    assert (angles[-1] - angles[0]).min() < np.deg2rad(-1.0)
-
-
-@pytest.mark.sim
-def test_locked_fingers_keep_their_angles(scene: Scene, cube: ObjectModel) -> None:
-    _closed_on(scene, cube)
-    engage(scene, "locked")
-    angles = _pushed(scene, 5.0 * FORCE, steps=20)
+    engage(scene, drive)
+    angles = _pushed(scene, force * FORCE, steps=steps)
     disengage(scene)
-    assert np.abs(angles - angles[0]).max() < STILL
+    if drive == "torque":
+        assert (angles[-1] - angles[0]).min() < np.deg2rad(-1.0)
+    else:
+        assert np.abs(angles - angles[0]).max() < STILL
 
 
 @pytest.mark.sim

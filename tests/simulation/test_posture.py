@@ -288,14 +288,6 @@ def test_a_preshape_that_the_hand_lacks_is_refused(tmp_path):
     )
 
 
-@pytest.mark.sim
-def test_public_trial_is_that_of_the_posture(cube, config, given):
-    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
-    trial = run_trial(placed, given)
-    assert trial.outcome is Outcome.SUCCESS
-    assert trial.stable
-
-
 def test_public_trial_refuses_what_is_no_posture(cube, config):
     placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
     assert "posture must be a Posture" in refused(run_trial, placed, np.zeros(18))

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from helpers.hands import slider_fingers, write_pincer, write_slider
+from helpers.hands import slider_fingers, write_slider
 from helpers.objects import (
     STANDOFF,
     box_model,
@@ -106,16 +106,6 @@ def test_it_is_not_asked_where_it_has_nothing_to_say(cube, hand):
     assert ask(cube, hand, closed) is None
 
 
-def test_attempt_that_says_where_its_fingers_start_is_never_screened(cube, config, scene):
-    """Verification opens the fingers by itself and wants to know what happens."""
-    attempt = replace(from_above(cube, 0.25), closing=np.zeros(3))
-    record = run_attempt(scene, standing(cube), attempt, config)
-    assert record.outcome is Outcome.MISSING_FINGERTIP
-    assert np.array_equal(
-        record.closed.q, run_attempt(scene, standing(cube), attempt, OFF).closed.q
-    )
-
-
 def test_prediction_depends_on_the_attempt_alone(cube, hand, config):
     """The poses of the object differ, and the higher one blocks no finger at the table."""
     drawn, made, together = drawn_attempts(cube, standing(cube), config), [], []
@@ -134,14 +124,6 @@ def test_prediction_depends_on_the_attempt_alone(cube, hand, config):
             assert alone.clear == found.clear
             assert np.array_equal(alone.closing, found.closing)
             assert np.array_equal(alone.last, found.last)
-
-
-def test_given_prediction_changes_no_bit(cube, hand, config, scene):
-    attempt = from_above(cube, STANDOFF)
-    alone = run_attempt(scene, standing(cube), attempt, config)
-    given = run_attempt(scene, standing(cube), attempt, config, ask(cube, hand, attempt))
-    assert np.array_equal(alone.lift.q, given.lift.q)
-    assert np.array_equal(alone.closed.contacts.f_Q_O, given.closed.contacts.f_Q_O)
 
 
 @pytest.mark.sim
@@ -163,18 +145,6 @@ def test_nothing_that_is_screened_would_have_been_lifted(tmp_path, hand, config)
     assert len(lost) == 20
     outcomes = {run_attempt(scene, X_TO, attempt, OFF).outcome for attempt in lost}
     assert outcomes <= {Outcome.START_COLLISION, Outcome.MISSING_FINGERTIP}
-
-
-def test_another_hand_is_screened_too(tmp_path, cube):
-    pincer = load_hand(write_pincer(tmp_path))
-    above = replace(from_above(cube, 0.03), X_OG=make_pose(np.diag([1.0, -1.0, -1.0]), [0, 0, 0.4]))
-    assert ask(cube, pincer, above).outcome is Outcome.SCREENED
-
-
-@pytest.mark.parametrize("key", ["start_margin", "reach_margin", "block_margin", "clearance"])
-def test_margins_are_lengths(key):
-    with pytest.raises(Exception, match=rf"screen\.{key}: must be greater than 0"):
-        load_config(overrides=[f"screen.{key}=-0.001"])
 
 
 @pytest.mark.parametrize(("text", "mode"), [("on", "on"), ("off", "off"), ("false", "off")])
@@ -210,25 +180,6 @@ def tip_distance(hand: Hand, finger: int, angle: float, attempt, wall: float) ->
     points = path.points[np.searchsorted(path.angles, angle), : path.tip]
     y = points @ attempt.X_OG[1, :3] + attempt.X_OG[1, 3]
     return float(np.abs(y - wall).min()) - 0.001
-
-
-def test_grid_that_is_fine_enough_leaves_the_margins(cube, tmp_path):
-    margins = ScreenConfig()
-    assert screen._widened(margins, cube.field) == margins
-    wide = screen._widened(margins, crate(tmp_path, 0.8).field)
-    assert wide.reach_margin > margins.reach_margin + 0.002
-    more = wide.reach_margin - margins.reach_margin
-    assert wide.clearance == pytest.approx(margins.clearance + more)
-
-
-def test_no_field_is_made_where_nobody_asks(cube, hand):
-    """Verification's attempts say where they begin, and a field takes longer than a close."""
-    model = replace(cube)
-    started = replace(from_above(cube, STANDOFF), closing=np.zeros(3))
-    assert predict(model, hand, standing(model), [started], ScreenConfig()) == [None]
-    off = ScreenConfig(mode="off")
-    assert predict(model, hand, standing(model), [from_above(cube, STANDOFF)], off) == [None]
-    assert "field" not in vars(model)
 
 
 # The sweep and the margins, against brute force
@@ -296,19 +247,6 @@ def test_fingers_start_before_they_may_cross(hand):
     (start,) = set(starts[0].tolist())
     assert all(gap(k) > screen.FINGER_GAP for k in range(0, start + 1, GAP_STRIDE))
     assert gap(start + GAP_STRIDE) <= screen.FINGER_GAP
-
-
-def test_fingers_start_before_they_may_cross_in_an_attempt(cube, hand):
-    """In the air, with margins so wide that it is simulated: they start well before their ends."""
-    attempt = from_above(cube, 0.25)
-    found = ask(cube, hand, attempt, reach_margin=1.0, block_margin=1.0, clearance=1e-4)
-    assert found.outcome is None
-    paths = hand_paths(hand, 0.0)
-    places = np.array([[np.searchsorted(path.angles, 9.0) - 1 for path in paths.fingers]])
-    starts = screen._clear_starts(paths, places)[0]
-    expected = [path.angles[k] for path, k in zip(paths.fingers, starts, strict=True)]
-    assert found.closing == pytest.approx(expected)
-    assert max(found.closing) < 0.9 * min(path.angles[-1] for path in paths.fingers)
 
 
 def lowest(hand: Hand) -> float:
@@ -379,24 +317,6 @@ def test_one_finger_that_is_not_required_screens_nothing(cube, hand):
         finger = replace(last, required=required, **nowhere)
         found = ask(cube, replace(hand, fingers=(*others, finger)), attempt)
         assert found.outcome is outcome
-
-
-def test_heights_and_distances_are_those_of_the_points(cube, hand):
-    """Lower bounds of the distances from the cube's faces; the least is exact where it matters."""
-    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.01, -0.02, 0.2])
-    lookup = screen.PointLookup(cube.field, standing(cube), X_OG[None])
-    p_GQ = np.array([[0.0, 0.0, 0.16], [0.028, 0.0, 0.2], [0.0, 0.016, 0.163]], dtype=np.float32)
-    p_OQ = p_GQ @ X_OG[:3, :3].T + X_OG[:3, 3]
-    rows = np.array([0])
-    np.testing.assert_allclose(
-        lookup.heights(rows, p_GQ)[0], p_OQ[:, 2] + standing(cube)[2, 3], atol=1e-6
-    )
-    outside = np.maximum(np.abs(p_OQ) - cube.half_extents, 0.0)
-    truth = np.linalg.norm(outside, axis=1)
-    found = lookup.distances(rows, p_GQ, 1.0)[0]
-    error = 2.0 * cube.field.error
-    assert np.all(found <= truth + 1e-4) and np.all(found >= truth - error - 1e-4)
-    assert found.min() == pytest.approx(truth.min(), abs=1e-4)
 
 
 def test_fingers_of_one_motor_start_together(tmp_path):

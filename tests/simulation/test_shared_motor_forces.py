@@ -151,14 +151,7 @@ def test_jaws_with_motors_of_their_own_are_not_centred(tmp_path: Path) -> None:
 
 def test_a_posture_is_not_centred(tmp_path: Path) -> None:
     """One whose fingers start open is an attempt like any other, but the palm pose is given."""
-    attempt = Attempt(
-        candidate=0,
-        standoff_index=0,
-        standoff=np.nan,
-        spread=0.0,
-        X_OG=make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, 0.004, 0.08]),
-        seed=0,
-        source=Source.POSTURES,
-    )
+    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, 0.004, 0.08])
+    attempt = Attempt(X_OG=X_OG, spread=0.0, source=Source.POSTURES)
     (found,) = centred(box(), gripper(tmp_path, one_motor=True), [attempt])
     assert found is attempt

@@ -271,9 +271,6 @@ PLAN: tuple[Kind, ...] = (
             "config_hash": ("a text",),  # `replay` compares them
             "mesh_sha256": ("a text",),
             "asked": ("a number",),
-            "combinations": ("a number",),
-            "valid": ("a number",),
-            "distinct": ("a number",),
         }
     ),
 )

@@ -16,9 +16,6 @@ _OBJECT = {
     "collision_error": "not negative",
     "resting": "list",
     "candidates": "count",
-    "combinations": "count",
-    "valid": "count",
-    "distinct": "count",
     "notes": "list of texts",
 }
 MANIFEST: tuple[Kind, ...] = (
@@ -79,9 +76,6 @@ MANIFEST: tuple[Kind, ...] = (
     value_kind(("objects", 0, "tried"), "is negative", "-1"),
     value_kind(("objects", 0, "name"), "leads outside", '"../../outside"'),
     value_kind(("objects", 0, "name"), "of another object", '"2_box_b"'),
-    value_kind(("objects", 0, "candidates"), "more than distinct", "5"),
-    value_kind(("objects", 0, "distinct"), "more than valid", "5"),
-    value_kind(("objects", 0, "valid"), "more than combinations", "5"),
     value_kind(("config", "candidates", "max"), "less than candidates", "3"),
     value_kind(("fingers", "thumb"), "is a number", "5"),
     value_kind(("schema_version",), "of the future", "999"),

@@ -32,7 +32,7 @@ CALM = Rule(
 class Down:
     """A sampler: palms above the object's centre that look straight down."""
 
-    def __init__(self, model, X_TO, stream):
+    def __init__(self, model, X_TO, stream, config):
         """Take an object at rest, and the random numbers of the draw."""
         self.far = 2.0 * np.sqrt(np.sum(model.half_extents**2))
         self.up, self.stream = X_TO[2, :3], stream
