@@ -316,25 +316,12 @@ class ImageRows:
         Raises:
             OSError: If the chunk is damaged.
         """
-        image = np.empty(self._shape, dtype=self._dataset.dtype)
-        self.read_into(row, image)
-        return image
-
-    def read_into(self, row: int, image: AnyArray) -> None:
-        """Read the image of a row.
-
-        Args:
-            row: Row of the field.
-            image: Contiguous array of an image's shape and type; it is overwritten.
-
-        Raises:
-            OSError: If the chunk is damaged.
-        """
         chunk = self._chunk(row) if self._inflated_here else None
         if chunk is None:
-            image[...] = self._dataset[row]
-        else:
-            _unshuffle(self._inflate(chunk, row), image)
+            return np.asarray(self._dataset[row])
+        image = np.empty(self._shape, dtype=self._dataset.dtype)
+        _unshuffle(self._inflate(chunk, row), image)
+        return image
 
     def _chunk(self, row: int) -> bytes | None:
         """Return the stored bytes of a row; None if a filter was skipped, or nothing is stored."""

@@ -207,26 +207,6 @@ class GraspDataset:
         except Exception as error:
             raise self._as_damage(error) from None
 
-    def read_images(self, name: str, rows: Sequence[int], images: npt.NDArray[Any]) -> None:
-        """Read images of some rows directly into an array.
-
-        Args:
-            name: Name of the field, `images` or `masks`.
-            rows: n rows, in any order.
-            images: Contiguous array (n, ...) of the field's type; it is overwritten.
-
-        Raises:
-            DataError: If the field is not a field of images.
-        """
-        field = self._field(name)
-        if not isinstance(field, ImageRows):
-            raise DataError(f"field must be one of images, masks, got {name!r}")
-        try:
-            for image, row in zip(images, rows, strict=True):
-                field.read_into(row, image)
-        except Exception as error:
-            raise self._as_damage(error) from None
-
     def column(self, name: str) -> npt.NDArray[Any]:
         """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
 
