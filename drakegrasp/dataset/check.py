@@ -20,12 +20,8 @@ import h5py
 import numpy as np
 
 from drakegrasp.config import CarriedHand, parse_stored
-from drakegrasp.dataset.assembly.survey import (
-    file_attributes,
-    headers_by_object,
-    known_homes,
-    shards_sha256,
-)
+from drakegrasp.dataset.assemble import file_attributes
+from drakegrasp.dataset.assembly.survey import headers_by_object, known_homes, shards_sha256
 from drakegrasp.dataset.card import card_counts
 from drakegrasp.dataset.check_rows import RowsTask, Violation, check_rows
 from drakegrasp.dataset.hdf5 import open_hdf5

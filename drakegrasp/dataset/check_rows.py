@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_rows, says_damage
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, says_damage
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field
@@ -230,11 +230,11 @@ def _read(file: Any, task: RowsTask) -> _Rows:
     """Read the rows of a task."""
     own, choice = file[task.group], slice(task.start, task.stop)
     # The seal proves that images are intact, and no rule here is about their colours and depths.
-    fields = (f for f in task.fields if f.name in own and not (f.sample and f.limits is None))
+    names = [f.name for f in task.fields if f.name in own and not (f.sample and f.limits is None)]
     return _Rows(
         of=task,
         numbers=np.arange(task.start, task.stop),
-        columns=Table({f.name: read_rows(own, f, choice) for f in fields}),
+        columns=read_columns(own, task.fields, names, choice),
         attributes=dict(file.attrs),
     )
 

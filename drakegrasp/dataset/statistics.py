@@ -38,7 +38,6 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.runtime.executor import Executor, run_here
 
 #: Name shown for postures without a preshape, for which all fingers close.
 NO_NAME = "-"
@@ -132,13 +131,12 @@ class Unfinished:
     total: int | None
 
 
-def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = run_here) -> bool:
+def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     """Return whether the three files exist and are what assembling would write now.
 
     Args:
         out: Directory of the dataset.
         verify_shards: Whether to compare the shards as well, which opens each of them.
-        execute: Executor that reads the shards.
 
     Raises:
         DataError: If a file stores values outside of itself, or a shard is missing.
@@ -146,7 +144,7 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
     manifest = read_manifest(out)
     expected = {"signature": manifest.signature()}
     if verify_shards:
-        expected["shards"] = shards_sha256(out, manifest, execute)
+        expected["shards"] = shards_sha256(out, manifest)
     try:
         for name in ASSEMBLED_FILES:
             with open_hdf5(out / name) as file:

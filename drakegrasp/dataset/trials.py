@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_rows, read_texts, sizes_in
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, read_names, read_texts, sizes_in
 from drakegrasp.dataset.opening import (
     open_samples,
     open_trials,
@@ -463,7 +463,7 @@ def _stored(
         codes: Valid codes of the column, see `refuse_other_codes`; None for measured values.
     """
     near = slice(int(rows[0]), int(rows[-1]) + 1)
-    values = read_rows(trials, FIELDS[name], near, FIELDS.values())
+    values = read_columns(trials, TRIAL_FIELDS, (name,), near)[name]
     if codes is not None:
         path = Path(trials.file.filename)
         refuse_other_codes(path, f"/trials/{name}", values, codes, near.start)
