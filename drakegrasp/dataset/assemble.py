@@ -340,8 +340,8 @@ def _samples_of(
     for name, own in IMAGES.items():
         stored = looks[f"{own}_{camera}"]
         images[name] = [stored.id.read_direct_chunk((k, *_within(stored))) for k in places.tolist()]
-    own = {name: trials[name][rows] for name in ASSEMBLED_FIELDS}
-    return _Samples(Table(values, **own), images)
+    known = {name: trials[name][rows] for name in ASSEMBLED_FIELDS}
+    return _Samples(Table(values | known), images)
 
 
 def _write_chunks(group: h5py.Group, columns: Table, first: int, pool: ThreadPoolExecutor) -> None:

@@ -205,7 +205,7 @@ class Manifest:
         rejected: Attempts that an inspection rejects: successes that are not samples.
         versions: Versions of the packages that built the dataset, and a hash of the hand's files.
         fingers: Names of the fingers in grasp order, each with whether a grasp needs its fingertip.
-        joints: Names of the hand's joints in the order of the fields `q`; empty in older datasets.
+        joints: Names of the hand's joints in the order of the fields `q`.
         schema_version: Version of the schema of the dataset's files.
     """
 
@@ -304,7 +304,7 @@ def origin_attributes(
         "seed": config.seed,
         "versions": json.dumps(versions, sort_keys=True),
         "fingers": json.dumps(dict(fingers)),
-        **({"joints": json.dumps(list(joints))} if joints else {}),
+        "joints": json.dumps(list(joints)),
     }
 
 
@@ -335,7 +335,7 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "split_by": manifest.config.split.by,
         "versions": manifest.versions,
         "fingers": manifest.fingers,
-        **({"joints": list(manifest.joints)} if manifest.joints else {}),
+        "joints": list(manifest.joints),
         "objects": [entry.to_json() for entry in manifest.objects],
         "refused": [stated(entry) for entry in manifest.refused],
     }

@@ -16,8 +16,7 @@ import numpy as np
 
 from drakegrasp.dataset.hdf5 import AnyArray, read_columns, write_fixed
 from drakegrasp.dataset.opening import (
-    COUNT,
-    TEXT,
+    Kind,
     Tables,
     differences,
     opened,
@@ -33,9 +32,9 @@ from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
 #: Fields of `/trials` that are known for the whole dataset only; shards do not have them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
-_ATTRIBUTES = {
-    **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), TEXT),
-    **dict.fromkeys(("start", "stop"), COUNT),
+_ATTRIBUTES: Mapping[str, Kind] = {
+    **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), str),
+    **dict.fromkeys(("start", "stop"), int),
 }
 
 
