@@ -17,7 +17,6 @@ import numpy as np
 from drakegrasp.dataset.hdf5 import AnyArray, read_columns, write_fixed
 from drakegrasp.dataset.opening import (
     Kind,
-    Tables,
     differences,
     opened,
     read_codes,
@@ -147,7 +146,6 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
 def open_shard(
     path: Path,
     header: ShardHeader | None,
-    tables: Tables | None = None,
     *,
     verify_seal: bool = True,
     again: bool = False,
@@ -157,8 +155,6 @@ def open_shard(
     Args:
         path: Path of the file.
         header: Identity that the shard must have; any if None.
-        tables: Fields that must exist; if None, all fields must exist, and outcomes and row numbers
-            must be valid.
         verify_seal: Whether to verify the seal first, which reads the whole file.
         again: Whether the same work has opened the shard before; then only its identity is checked.
 
@@ -183,11 +179,10 @@ def open_shard(
                 f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
             )
 
-        # Check the columns.
+        # Check the columns, outcomes and row numbers.
         if not again:
-            every = {"trials": trial_columns(), "looks": LOOK_FIELDS}
-            refuse_first(path, differences(file, every if tables is None else tables))
-        if not again and tables is None:
+            tables = {"trials": trial_columns(), "looks": LOOK_FIELDS}
+            refuse_first(path, differences(file, tables))
             outcomes = read_codes(file["trials/outcome"], list(Outcome))
             read_codes(file["looks/row"], len(outcomes))
         yield file, own_header
