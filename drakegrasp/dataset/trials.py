@@ -193,8 +193,8 @@ class Trials:
 
         Args:
             names: Fields of `/trials`, or DERIVED ones; if None, all except `split`, which is read
-                from the data files. A field that an older file lacks, or whose stage an attempt did
-                not reach, is NaN, 0 or False.
+                from the data files. A field that the file lacks, or whose stage an attempt did not
+                reach, is NaN, 0 or False.
 
         Raises:
             DataError: If there is no such column, or a file was replaced.
