@@ -126,10 +126,8 @@ def assemble(
     from drakegrasp.dataset.rejections import read_rejected, unused_rejections
 
     rejected = () if reject is None else read_rejected(reject)
-    with processes(workers) as execute, progress_bar("assemble", "tasks") as progress:
-        assemble_files(
-            out, overrides=overrides, rejected=rejected, execute=execute, progress=progress
-        )
+    with progress_bar("assemble", "shards") as progress:
+        assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
         manifest = read_manifest(out)
     if manifest.config.scenes.when == "assembled":
         write_scenes(out, workers=workers)
@@ -184,9 +182,7 @@ def write_scenes(
 @described
 @click.argument("into", type=PATH, metavar="INTO")
 @click.argument("outs", type=PATH, metavar="OUTS...", nargs=-1, required=True)
-def merge(
-    into: Path, outs: tuple[Path, ...], overrides: tuple[str, ...], workers: int | None
-) -> None:
+def merge(into: Path, outs: tuple[Path, ...], overrides: tuple[str, ...]) -> None:
     """Merge several datasets that were built separately.
 
     The datasets may differ only in their objects, their seeds, their parts (`build --part`), and
@@ -194,13 +190,13 @@ def merge(
     is complete; OUTS do not change.
 
     Options:
-        ASSEMBLED, --workers
+        ASSEMBLED
     """
     from drakegrasp.cli import tables
     from drakegrasp.generation.merge import merge as merge_datasets
 
-    with processes(workers) as execute, progress_bar("merge", "tasks") as progress:
-        merge_datasets(into, outs, overrides=overrides, execute=execute, progress=progress)
+    with progress_bar("merge", "shards") as progress:
+        merge_datasets(into, outs, overrides=overrides, progress=progress)
     tables.print_stats(into)
 
 

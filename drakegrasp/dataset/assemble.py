@@ -1,53 +1,53 @@
 """From shards to trials.hdf5, grasping_oto.hdf5, grasping_otm.hdf5 and their data card.
 
 Input: a directory whose work units are all done. Output: the three files, all or none, and their
-card. An `Executor` runs the work in tasks: `assembly.survey` reads the shards of an object,
-`assembly.pack` compresses the chunks of a range of rows. This process decides which successes
-become samples, and writes the chunks to the files. It keeps a few numbers per success, whatever the
-number of attempts. It does not import Drake.
+card. `assembly.survey` reads the successes and decides which become samples; then the rows go from
+the shards into the files, some thousand at a time. This process keeps a few numbers per success,
+whatever the number of attempts. It does not import Drake.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import chain, product
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.assembly.pack import (
-    PackTask,
-    pack_rows,
-    pack_tasks,
-    sample_texts,
-    unpack_rows,
-)
-from drakegrasp.dataset.assembly.survey import (
-    Survey,
-    decide,
-    file_attributes,
-    keys_of,
-    number_rows,
-    object_columns,
-    survey_object,
-    survey_tasks,
-)
+from drakegrasp.dataset.assembly.samples import IMAGES, sample_values
+from drakegrasp.dataset.assembly.survey import Decisions, ShardRows, Survey, decide, keys_of, survey
 from drakegrasp.dataset.card import card_files, content_of
-from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
+from drakegrasp.dataset.hdf5 import (
+    COLUMN_CHUNK,
+    AnyArray,
+    create_field,
+    packed_chunk,
+    read_columns,
+    write_field,
+)
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
     manifest_text,
+    origin_attributes,
     read_manifest,
     with_postprocessing,
 )
 from drakegrasp.dataset.opening import open_samples, open_trials, read_codes
-from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE, model_path
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import (
+    CAMERAS,
     DATA_FIELDS,
+    LOOK_FIELDS,
     OBJECT_FIELDS,
     SPLITS,
     SUCCESS_FIELDS,
@@ -55,11 +55,19 @@ from drakegrasp.dataset.schema import (
     Field,
     stored_fields,
 )
-from drakegrasp.errors import DataError
+from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, open_shard
 from drakegrasp.filters import Removal
-from drakegrasp.runtime.executor import Executor, in_order, run_here
+from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.runtime.environment import available_cores
 from drakegrasp.runtime.files import disk_full_named, new_hdf5, replaced_together, sweep_temporary
 from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.table import Table, join
+from drakegrasp.vision.camera import intrinsics
+
+#: Rows that are written at once: about ten of the largest shards, 30 MB in memory.
+BLOCK = 8 * COLUMN_CHUNK
+#: Text fields of a sample, and the attributes of its object that they repeat.
+TEXTS = {"object_props/object_name": "name", "object_props/class_name": "class_name"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +93,6 @@ def assemble(
     *,
     overrides: Sequence[str] = (),
     rejected: Sequence[int | AttemptKey] = (),
-    execute: Executor = run_here,
     progress: Report = silent,
 ) -> Assembly:
     """Write the three files of a dataset whose work units are all done.
@@ -96,8 +103,7 @@ def assemble(
             split changes, all objects are drawn anew.
         rejected: Trials that an inspection rejects, as ids or identities; they do not become
             samples.
-        execute: Executor of the tasks; the files do not depend on it.
-        progress: Called with the number of finished tasks and the number of all tasks.
+        progress: Called with the number of finished steps and the number of all steps.
 
     Raises:
         ConfigError: If an override cannot be used; nothing is changed.
@@ -111,7 +117,7 @@ def assemble(
         read_manifest(out)
     with build_lock(out):
         manifest = with_postprocessing(read_manifest(out), overrides)
-        return assemble_locked(out, manifest, rejected=rejected, execute=execute, progress=progress)
+        return assemble_locked(out, manifest, rejected=rejected, progress=progress)
 
 
 def assemble_locked(
@@ -119,7 +125,7 @@ def assemble_locked(
     manifest: Manifest,
     *,
     rejected: Sequence[int | AttemptKey] | None = None,
-    execute: Executor = run_here,
+    surveyed: Survey | None = None,
     progress: Report = silent,
 ) -> Assembly:
     """Write the three files, their card and the manifest; the caller holds the lock.
@@ -128,21 +134,18 @@ def assemble_locked(
         out: Directory of the dataset.
         manifest: Manifest of the dataset; its filters and split may differ from those on disk.
         rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
-        execute: As for `assemble`.
+        surveyed: Survey of the shards, if there is one; its successes do not depend on the filters.
         progress: As for `assemble`.
     """
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
-        # Survey the shards: the number of rows, and what the filters need of each success.
-        shards = number_rows(_survey_all(out, manifest, execute, progress), manifest)
-
         # Decide which successes become samples, and in which split.
+        surveyed = surveyed or survey(out, manifest, progress=progress)
         if rejected is not None:
-            known = keys_of(manifest, shards.successes)
+            known = keys_of(manifest, surveyed.successes)
             manifest = replace(manifest, rejected=find_keys(rejected, known, out))
-        decisions = decide(manifest, shards)
+        decisions = decide(manifest, surveyed)
         manifest = decisions.manifest
-        repeats = manifest.config.robustness.repeats > 0
 
         # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
@@ -151,23 +154,17 @@ def assemble_locked(
                 c: stack.enter_context(new_hdf5(path, sealed=True)) for c, path in paths.items()
             }
             for camera, file in files.items():
-                file.attrs.update(file_attributes(manifest, shards.seals, camera))
+                file.attrs.update(file_attributes(manifest, surveyed.seals, camera))
                 counts = {split: len(ids) for split, ids in decisions.ids.items()}
-                fields = stored_fields(DATA_FIELDS if camera else TRIAL_FIELDS, repeats=repeats)
-                for name, count in (counts if camera else {"trials": shards.count}).items():
+                for name, count in (counts if camera else {"trials": surveyed.count}).items():
                     group = file.create_group(name)
-                    for f in fields:
-                        create_field(group, f, f.row_shape(shards.sizes), count)
-            _write_table(files[""], "objects", OBJECT_FIELDS, object_columns(manifest))
-            _write_table(files[""], "successes", SUCCESS_FIELDS, decisions.columns())
-
-            # Rows are packed in any order, and each chunk is written at its own position.
-            tasks = list(pack_tasks(out, decisions, repeats=repeats))
-            texts = sample_texts(manifest)
-            surveyed = len({piece.object for piece in shards.slices})
-            for done, task in enumerate(_packed(execute, tasks), start=1):
-                unpack_rows(task, files, texts)
-                progress(surveyed + done, surveyed + len(tasks))
+                    for f in _fields(manifest, DATA_FIELDS if camera else TRIAL_FIELDS):
+                        create_field(group, f, f.row_shape(surveyed.sizes), count)
+            _write_table(files[""], "objects", OBJECT_FIELDS, _object_columns(manifest))
+            ids = surveyed.successes["trial_id"]
+            successes = {"trial_id": ids, "removal": decisions.removal}
+            _write_table(files[""], "successes", SUCCESS_FIELDS, successes)
+            _write_rows(out, decisions, files, progress)
 
         # The card describes the files in words and numbers. The manifest, with filters, split and
         # rejections, changes together with the files.
@@ -176,31 +173,6 @@ def assemble_locked(
             new(name).write_bytes(text)
         new(FILE_NAME).write_bytes(manifest_text(manifest))
     return summarise(out)
-
-
-def _survey_all(out: Path, manifest: Manifest, execute: Executor, progress: Report) -> list[Survey]:
-    """Return the surveys of all objects with a palm pose, in the order of /objects.
-
-    Raises:
-        DataError: If a shard is missing or damaged, or no object has a palm pose.
-    """
-    surveys = []
-    for survey in in_order(execute)(survey_object, survey_tasks(out, manifest)):
-        surveys.append(survey)
-        progress(len(surveys), 2 * len(manifest.objects))
-    if not surveys:
-        raise DataError(f"{out}: no object has a palm pose to try")
-    return surveys
-
-
-def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[PackTask]:
-    """Yield the tasks whose parts are written, in order; remove the remaining parts at the end."""
-    try:
-        # Closing this generator first closes the one of the tasks, so no task writes any more.
-        yield from in_order(execute)(pack_rows, tasks)
-    finally:
-        for task in tasks:
-            Path(task.part).unlink(missing_ok=True)
 
 
 def summarise(out: Path) -> Assembly:
@@ -220,6 +192,43 @@ def summarise(out: Path) -> Assembly:
         )
 
 
+def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[str, Any]:
+    """Return the attributes of a file.
+
+    Args:
+        manifest: Manifest of the dataset.
+        seals: Hash of the seals of the shards, hexadecimal.
+        camera: `oto` or `otm`; empty for the trials.
+    """
+    lens = manifest.config.camera
+    own = {"camera": camera, "split_by": manifest.config.split.by} if camera else {}
+    return {
+        **origin_attributes(manifest.config, manifest.versions, manifest.fingers, manifest.joints),
+        "K": intrinsics(lens),
+        "near": lens.near,
+        "far": lens.far,
+        "signature": manifest.signature(),
+        "shards": seals,
+        **own,
+    }
+
+
+def _fields(manifest: Manifest, fields: Sequence[Field]) -> tuple[Field, ...]:
+    return stored_fields(fields, repeats=manifest.config.robustness.repeats > 0)
+
+
+def _object_columns(manifest: Manifest) -> dict[str, AnyArray]:
+    """Return the columns of /objects."""
+    columns = {}
+    for field in OBJECT_FIELDS:
+        own = [getattr(entry, field.name) for entry in manifest.objects]
+        values = [np.nan if value is None else value for value in own]
+        columns[field.name] = np.array(
+            values, dtype=object if field.dtype == "str" else field.dtype
+        )
+    return columns
+
+
 def _write_table(
     file: h5py.File, name: str, fields: Sequence[Field], columns: Mapping[str, AnyArray]
 ) -> None:
@@ -227,3 +236,147 @@ def _write_table(
     group = file.create_group(name)
     for field in fields:
         write_field(group, field, columns[field.name])
+
+
+# Rows
+
+#: A split and a camera.
+Place = tuple[str, str]
+
+
+class _Samples(NamedTuple):
+    """Some samples as one camera sees them.
+
+    Attributes:
+        values: Their numbers, by the names of DATA_FIELDS, and `object`, their row of /objects.
+        images: For each field of IMAGES the stored chunk of each sample, with the mask of the
+            filters that HDF5 skipped.
+    """
+
+    values: Table
+    images: Mapping[str, list[tuple[int, bytes]]]
+
+
+def _write_rows(
+    out: Path, decisions: Decisions, files: Mapping[str, h5py.File], progress: Report
+) -> None:
+    """Write all rows into their allocated places, from the first to the last.
+
+    Args:
+        out: Directory of the dataset.
+        decisions: What is decided about the successes.
+        files: For each camera its open data file; for the key "" the file of the trials.
+        progress: As for `assemble`.
+    """
+    shards, count = decisions.survey.shards, decisions.survey.count
+    firsts = [shard.first for shard in shards]
+    written: Counter[Place] = Counter()
+    with ThreadPoolExecutor(available_cores()) as pool:
+        for start in range(0, count, BLOCK):
+            # From the shard in which the block begins to the shard in which it ends.
+            stop = min(start + BLOCK, count)
+            last = bisect_left(firsts, stop)
+            own = shards[bisect_right(firsts, start) - 1 : last]
+            trials, samples = _read_block(out, decisions, own, start, stop)
+
+            _write_chunks(files[""]["trials"], trials, start, pool)
+            for place in product(decisions.ids, CAMERAS):
+                split, camera = place
+                if parts := samples.get(place):
+                    group, first = files[camera][split], written[place]
+                    written[place] += _write_samples(group, parts, first, decisions.manifest)
+            progress(len(shards) + last, 2 * len(shards))
+
+
+def _read_block(
+    out: Path, decisions: Decisions, shards: Sequence[ShardRows], start: int, stop: int
+) -> tuple[Table, dict[Place, list[_Samples]]]:
+    """Return the rows `start` to `stop` - 1 of /trials, and the samples among them.
+
+    The seals are not verified here, since the survey has verified them.
+    """
+    tables, samples = list[Table](), defaultdict[Place, list[_Samples]](list)
+    names = [f.name for f in _fields(decisions.manifest, TRIAL_FIELDS)]
+    for shard in shards:
+        path, header = shard.header.path(out), shard.header
+        with open_shard(path, header, verify_seal=False, again=True) as (file, _):
+            stored = [name for name in names if name not in ASSEMBLED_FIELDS]
+            trials = read_columns(file["trials"], TRIAL_FIELDS, stored)
+            trials = trials.with_columns(
+                trial_id=shard.first + np.arange(trials.count, dtype=np.int64),
+                object=np.full(trials.count, shard.object, dtype=np.int32),
+            )
+            first, last = max(start, shard.first), min(stop, shard.first + shard.count)
+            tables.append(trials[first - shard.first : last - shard.first])
+            for split, ids in decisions.ids.items():
+                own = ids[slice(*np.searchsorted(ids, (first, last)))]
+                for camera in CAMERAS if len(own) else ():
+                    model = _load(model_path(out, header.object_name))
+                    part = _samples_of(file["looks"], trials, own - shard.first, model, camera)
+                    samples[split, camera].append(part)
+    return join(tables), samples
+
+
+#: The shards of an object follow each other.
+_load = lru_cache(1)(load_object)
+
+
+def _samples_of(
+    looks: h5py.Group, trials: Table, rows: AnyArray, model: ObjectModel, camera: str
+) -> _Samples:
+    """Return samples of a shard.
+
+    Args:
+        looks: Group /looks of the shard.
+        trials: The rows of /trials of the shard.
+        rows: (n,), the samples' rows.
+        model: The object.
+        camera: `oto` or `otm`.
+    """
+    poses = read_columns(looks, LOOK_FIELDS, ("row", "X_CI_otm", *(f"X_TC_{c}" for c in CAMERAS)))
+    places = np.searchsorted(poses["row"], rows)
+    values = sample_values(model, trials[rows], poses[places], camera)
+    images = {}
+    for name, own in IMAGES.items():
+        stored = looks[f"{own}_{camera}"]
+        images[name] = [stored.id.read_direct_chunk((k, *_within(stored))) for k in places.tolist()]
+    known = {name: trials[name][rows] for name in ASSEMBLED_FIELDS}
+    return _Samples(Table(values | known), images)
+
+
+def _write_chunks(group: h5py.Group, columns: Table, first: int, pool: ThreadPoolExecutor) -> None:
+    """Write columns whose first row begins a chunk; the pool compresses the chunks."""
+    rows = group["trial_id"].chunks[0]
+
+    def pack(place: tuple[str, int]) -> bytes:
+        name, start = place
+        return packed_chunk(columns[name][start : start + rows], rows)
+
+    places = list(product(sorted(columns), range(0, columns.count, rows)))
+    for (name, start), chunk in zip(places, pool.map(pack, places), strict=True):
+        column = group[name]
+        column.id.write_direct_chunk((first + start, *_within(column)), chunk)
+
+
+def _write_samples(
+    group: h5py.Group, parts: Sequence[_Samples], first: int, manifest: Manifest
+) -> int:
+    """Write samples of one split and camera from a row on, and return their number."""
+    values = join([part.values for part in parts])
+    for name in IMAGES:
+        images = group[name]
+        for row, (skipped, chunk) in enumerate(chain(*(part.images[name] for part in parts))):
+            images.id.write_direct_chunk((first + row, *_within(images)), chunk, skipped)
+    rows = slice(first, first + values.count)
+    for field in _fields(manifest, DATA_FIELDS):
+        if field.name not in (*IMAGES, *TEXTS):
+            group[field.name][rows] = values[field.name].astype(field.dtype)
+    for name, attribute in TEXTS.items():
+        texts = [getattr(entry, attribute) for entry in manifest.objects]
+        group[name][rows] = [texts[i] for i in values["object"].tolist()]
+    return values.count
+
+
+def _within(column: h5py.Dataset) -> tuple[int, ...]:
+    """Return the position of a chunk without its row."""
+    return (0,) * (column.ndim - 1)

@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 
-from drakegrasp.arithmetic import norm
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.hdf5 import AnyArray, read_names
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
@@ -36,7 +34,7 @@ from drakegrasp.dataset.statistics import (
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, HandError, printable
 from drakegrasp.filters import Removal
-from drakegrasp.hand.file_format import HandFile, rated_load, read_hand_file
+from drakegrasp.hand.file_format import HandFile, read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.hand.folder import HandFolder, hand_folder
 from drakegrasp.outcomes import Outcome
@@ -142,8 +140,6 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     with open_samples(data) as file:
         rule = str(file.attrs.get("split_by", "class"))
         counts = _counts(file, funnel, distinct_samples(attempts))
-        # Optional entries of the card, which most datasets lack.
-        more = {"fingertip_loads": _loads(file, hand and rated_load(hand[0]))}
 
     # The known limits, and one limit that follows from the counts.
     limits = [*LIMITS]
@@ -165,7 +161,6 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "versions": manifest.versions,
         "licences": licences(entries),
         "counts": counts,
-        **{key: value for key, value in more.items() if value is not None},
         "refused": {mesh.name: mesh.reason for mesh in manifest.refused},
         "files": FILES,
         "conventions": CONVENTIONS,
@@ -228,25 +223,6 @@ def _hand_licences(config: Config, hand: KnownHand | None) -> dict[str, str]:
         lines = (printable(line.strip()) for line in text.splitlines())
         found[place] = next(filter(None, lines), "")[:LONGEST_LINE]
     return found or ({"LICENSE": OWN_LICENCE} if config.hand in hand_names() else {})
-
-
-def _loads(file: h5py.File, rated: float | None) -> dict[str, Any] | None:
-    """Return how the samples' forces compare with the hand's rated load, if it is known.
-
-    The force of a fingertip is the larger of its forces after closing and after the lift.
-    """
-    if rated is None:
-        return None
-    forces = [
-        np.maximum(*(norm(file[split][f"grasp_props/f_Q_C{when}"][:]) for when in ("", "_held")))
-        for split in SPLITS
-    ]
-    # A finger that a preshape leaves out has no force.
-    largest = np.nan_to_num(np.concatenate(forces)).max(axis=1, initial=0.0)
-    loads = {"rated_N": rated, "above": int((largest > rated).sum()), "samples": len(largest)}
-    if len(largest):
-        loads["median_N"] = round(float(np.median(largest)), 1)
-    return loads
 
 
 def _counts(file: h5py.File, funnel: Funnel, distinct: AnyArray) -> dict[str, Any]:
@@ -447,17 +423,6 @@ a verdict. No object is in two splits.
 {_table(heads, rows)}"""
 
 
-def _pressed(content: Mapping[str, Any]) -> str:
-    rated, above, samples, *median = content["fingertip_loads"].values()
-    if not samples:
-        return ""
-    return f"""## Forces and the hand
-
-The maker allows {rated:.1f} N at a fingertip. In {above:,} of {samples:,} samples one presses
-harder, after closing or after the lift; the median of the largest force is {median[0]:.1f} N. The
-setting `physics.finger_load` makes the motors weaker."""
-
-
 def _limits(content: Mapping[str, Any]) -> str:
     lines = "\n".join(f"* {each['limit']} ({each['docs']})" for each in content["limits"])
     return f"## Known limits\n\nThe pages are those of drakegrasp's repository.\n\n{lines}"
@@ -470,7 +435,6 @@ SECTIONS: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
     ("settings", _how),
     ("licences", _licences),
     ("counts", _how_many),
-    ("fingertip_loads", _pressed),
     ("scenes", _scenes),
     ("limits", _limits),
 )

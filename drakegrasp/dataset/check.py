@@ -19,13 +19,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from drakegrasp.config import CarriedHand, parse_stored
-from drakegrasp.dataset.assembly.survey import (
-    file_attributes,
-    headers_by_object,
-    known_homes,
-    shards_sha256,
-)
+from drakegrasp.config import CarriedHand
+from drakegrasp.dataset.assemble import file_attributes
+from drakegrasp.dataset.assembly.survey import headers_by_object, known_homes, shards_sha256
 from drakegrasp.dataset.card import card_counts
 from drakegrasp.dataset.check_rows import RowsTask, Violation, check_rows
 from drakegrasp.dataset.hdf5 import open_hdf5
@@ -37,7 +33,7 @@ from drakegrasp.dataset.opening import (
     ORIGIN,
     SCENE_TABLES,
     TRIAL_TABLES,
-    Rule,
+    Kind,
     Tables,
     attribute_mistakes,
     differences,
@@ -59,27 +55,29 @@ from drakegrasp.dataset.shards import ShardHeader, open_shard
 from drakegrasp.dataset.trials import Trials, stamp
 from drakegrasp.errors import DataError, DrakegraspError, first_line
 from drakegrasp.filters import Removal
-from drakegrasp.foreign_files import parse_json, read_json
+from drakegrasp.foreign_files import read_json
 from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import refuse_broken_seal
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.vision.camera import intrinsics
 
 __all__ = ["Violation", "check_dataset"]
 
 #: Number of rows in a task: some 20 MB.
 TASK_ROWS = 1024
-#: What a file needs, by the group that only it has: rules of its attributes, and its fields.
-KINDS: Mapping[str, tuple[Mapping[str, Rule], Tables]] = {
+#: Attributes and fields of a file, by the group that only it has.
+KINDS: Mapping[str, tuple[Mapping[str, Kind], Tables]] = {
     "train": (OF_CAMERA, DATA_TABLES),
     "trials": (ORIGIN, TRIAL_TABLES),
     "views": (OF_SCENES, SCENE_TABLES),
 }
 #: Attributes of the state of a dataset that a file is of, a cause of other differences first;
 #: scenes have the first two.
-STATE = ("signature", "shards", "camera", "split_by", "versions", "fingers", "joints")
+STATE = (
+    *("signature", "shards", "camera", "split_by", "versions", "fingers", "joints"),
+    *("config_hash", "seed", "K", "near", "far"),
+)
 
 #: A part of the check that runs in any process.
 Task = Callable[[], list[Violation]]
@@ -154,17 +152,17 @@ class _Look:
             dataset: See `RowsTask`.
         """
         yield partial(_seal, self.path)
-        counts, now = {**known, **self.counts}, stamp(self.path)
+        now = stamp(self.path)
         for group, count in self.counts.items():
             for start in range(0, count, TASK_ROWS):
                 task = RowsTask(
                     path=self.path,
                     stamp=now,
                     group=group,
-                    start=start,
-                    stop=min(start + TASK_ROWS, count),
+                    rows=slice(start, min(start + TASK_ROWS, count)),
                     fields=self.tables[group],
-                    counts=counts,
+                    attributes=self.attributes,
+                    counts={**known, **self.counts},
                     dataset=dataset,
                 )
                 yield partial(check_rows, task)
@@ -172,50 +170,21 @@ class _Look:
 
 def _look_at(path: Path, file: h5py.File, kind: str) -> _Look:
     """Check the attributes and the layout of a file; no row is read."""
-    rules, tables = KINDS[kind]
-    found = [
-        Violation(file=path.name, what=each.what, got=each.got)
-        for each in attribute_mistakes(file, rules).values()
-    ]
-    found += [] if found else _attributes(path.name, file.attrs, scenes=kind == "views")
+    kinds, tables = KINDS[kind]
+    mistakes = list(attribute_mistakes(file, kinds))
     # A group with an invalid column is not read; without sound attributes, nothing is.
-    broken = {*tables} if found else set[str]()
-    for each in differences(file, tables, thorough=True):
-        found.append(Violation(file=path.name, group=each.path, what=each.what, got=each.got))
-        if not each.text_only:
-            broken.add(each.path[1:].split("/")[0])
-    sound = [group for group in tables if group in file and group not in broken]
+    layout = list(differences(file, tables))
+    broken = {*tables} if mistakes else {each.path[1:].split("/")[0] for each in layout}
     return _Look(
         path=path,
         tables=tables,
-        counts={group: len(file[group][tables[group][0].name]) for group in sound},
+        counts={g: len(file[g][tables[g][0].name]) for g in tables if g not in broken},
         attributes=dict(file.attrs),
-        found=found,
+        found=[
+            Violation(file=path.name, group=each.path, what=each.what, got=each.got)
+            for each in (*mistakes, *layout)
+        ],
     )
-
-
-def _attributes(name: str, attributes: Mapping[str, Any], *, scenes: bool) -> Iterator[Violation]:
-    """The attributes that follow from the configuration agree with it.
-
-    Args:
-        name: Name of the file.
-        attributes: Attributes that each are as their rules say.
-        scenes: Whether the file is scenes.hdf5, whose cameras have settings of their own.
-    """
-    try:
-        config = parse_stored(parse_json(attributes["config"]))
-    except ValueError as error:
-        what = "attribute config must be a configuration of drakegrasp"
-        yield Violation(file=name, what=what, got=f"another ({first_line(error)})")
-        return
-    lens = config.scenes if scenes else config.camera
-    due: dict[str, Any] = {"config_hash": config.simulation_hash(), "seed": config.seed}
-    due |= {"near": lens.near, "far": lens.far}
-    due |= {} if scenes else {"K": intrinsics(config.camera)}
-    for key, value in due.items():
-        if not np.array_equal(attributes[key], value):
-            got = " ".join(str(attributes[key]).split())
-            yield Violation(file=name, what=f"attribute {key} must be that of its config", got=got)
 
 
 def _look_at_one(path: Path) -> tuple[list[Violation], list[Task]]:
@@ -285,7 +254,8 @@ def _other_state(look: _Look, due: Mapping[str, Any]) -> Iterator[Violation]:
     """
     scenes, of = "views" in look.tables, {"shards": "the shards that are there"}
     for key in STATE[:2] if scenes else STATE:
-        if due.get(key) and key in look.attributes and look.attributes[key] != due[key]:
+        told = key in due and key in look.attributes and (key != "shards" or due[key])
+        if told and not np.array_equal(look.attributes[key], due[key]):
             yield Violation(
                 file=look.path.name,
                 what=f"attribute {key} must be that of {of.get(key, FILE_NAME)}",

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_rows, says_damage
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, says_damage
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field
@@ -101,8 +100,9 @@ class RowsTask:
         path: Path of the file, whose layout is that of the schema.
         stamp: State of the file, see `drakegrasp.dataset.trials.stamp`.
         group: Name of the group.
-        start, stop: Range of the rows.
+        rows: Range of the rows.
         fields: Fields of the group.
+        attributes: Attributes of the file.
         counts: Number of rows of the groups that the group's rows refer to, as far as known.
         dataset: Manifest of the dataset around a data file whose samples are compared with their
             trials and meshes; None to check the rows by themselves.
@@ -111,83 +111,20 @@ class RowsTask:
     path: Path
     stamp: Stamp
     group: str
-    start: int
-    stop: int
+    rows: slice
     fields: tuple[Field, ...]
+    attributes: Mapping[str, Any]
     counts: Mapping[str, int]
     dataset: Manifest | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Rows:
-    """Rows n of a task that broke no rule so far.
-
-    Attributes:
-        of: The task.
-        numbers: (n,), numbers of the rows in their group.
-        columns: The columns that the group has, without images that have no limits.
-        attributes: Attributes of the file.
-    """
-
-    of: RowsTask
-    numbers: AnyArray
-    columns: Table
-    attributes: Mapping[str, Any]
-
-    def __getitem__(self, name: str) -> AnyArray:
-        return self.columns[name]
-
-    @property
-    def fields(self) -> Iterator[Field]:
-        """The fields that were read."""
-        return (f for f in self.of.fields if self.columns.has(f.name))
-
-    def where(self, keep: AnyArray) -> _Rows:
-        """Return the rows where `keep` (n,) is true."""
-        return _Rows(
-            of=self.of,
-            numbers=self.numbers[keep],
-            columns=self.columns[keep],
-            attributes=self.attributes,
-        )
-
-    @cached_property
-    def stage(self) -> AnyArray:
-        """The stage (n,) that each row reached; a sample reached the last one."""
-        if self.of.group != "trials":
-            return np.full(len(self.numbers), Stage.LIFTED.value)
-        reached = np.zeros(256, dtype=int)
-        reached[[each.value for each in Outcome]] = [each.stage.value for each in Outcome]
-        # The hand can touch the table while it closes, or in the lift.
-        late = (self["outcome"] == Outcome.TABLE_CONTACT) & np.isfinite(self["time_lift"])
-        return np.where(late, Stage.LIFTED.value, reached[self["outcome"]])
-
-    def touching(self, field: Field) -> AnyArray:
-        """Return which fingers (n, k) have a contact at the time of a field."""
-        if self.of.group == "trials":
-            return self["lifted_touching" if "lifted" in field.name else "closed_touching"]
-        return ~unused_fingers(self["grasp_props/unused"], self["grasps"].shape[1] // 6)
-
-    def pose(self, name: str) -> Array:
-        """Return the poses (n, 4, 4) in a field of a sample's `object_props`."""
-        return unpack_pose(self[f"object_props/{name}"].astype(float))
-
-    @cached_property
-    def X_CW(self) -> Array:
-        """The poses (n, 4, 4) of the world in the frame of the file's camera, of samples."""
-        return self.pose(f"frame_cam2work_{self.attributes['camera']}") @ invert_pose(X_WT)
-
-    @cached_property
-    def contacts(self) -> tuple[Array, Array]:
-        """p_CQ [m] and nhat_Q_C, (n, k, 3) each, of the closed hands of samples."""
-        vectors = self["grasps"].astype(float).reshape(len(self.numbers), 2, -1, 3)
-        return vectors[:, 0], vectors[:, 1]
-
-
 #: The words of a rule, the rows (n,) that break it, and what they have instead (n, ...).
 Finding: TypeAlias = tuple[str, AnyArray, AnyArray]
-#: A check of rows, which yields what it finds.
-RowCheck: TypeAlias = Callable[[_Rows], Iterator[Finding]]
+#: A check of the rows of a task: a table with their columns, without images that have no limits,
+#: and the column NUMBER.
+RowCheck: TypeAlias = Callable[[Table, RowsTask], Iterator[Finding]]
+#: Column of the number of each row in its group; no field has this name.
+NUMBER = "#"
 
 
 def check_rows(task: RowsTask) -> list[Violation]:
@@ -196,16 +133,20 @@ def check_rows(task: RowsTask) -> list[Violation]:
     Raises:
         DataError: If the path now has another file.
     """
+    # The seal proves that images are intact, and no rule here is about their colours and depths.
+    names = [f.name for f in task.fields if not (f.sample and f.limits is None)]
     name, group = task.path.name, f"/{task.group}"
     with reopened(task.path, task.stamp, "a file of a dataset") as file:
         try:
-            rows = _read(file, task)
+            own = [name for name in names if name in file[task.group]]
+            t = read_columns(file[task.group], task.fields, own, task.rows)
         except Exception as error:
             if not says_damage(error):
                 raise
-            what = f"rows {task.start} to {task.stop - 1} must be readable"
+            what = f"rows {task.rows.start} to {task.rows.stop - 1} must be readable"
             return [Violation(file=name, group=group, what=what, got=first_line(error))]
 
+    t = t.with_columns({NUMBER: np.arange(task.rows.start, task.rows.stop)})
     stages: list[list[RowCheck]] = [[_numbers], [_complete, _limits], [_rigid, _derived]]
     if task.group in SPLITS:
         stages += [[_chain], [_in_mask]]
@@ -213,30 +154,23 @@ def check_rows(task: RowsTask) -> list[Violation]:
             stages += [[_of_sample], [_as_in_trials], [_on_mesh]]
     found = list[Violation]()
     for checks in stages:
-        sound = np.ones(len(rows.numbers), dtype=bool)
-        for what, bad, got in (each for check in checks if len(sound) for each in check(rows)):
+        sound = np.ones(t.count, dtype=np.bool_)
+        for what, bad, got in (each for check in checks if t.count for each in check(t, task)):
             if bad.any():
-                first, more = int(np.argmax(bad)), int(bad.sum()) - 1
-                row, said = int(rows.numbers[first]), _said(np.asarray(got)[first])
+                first = int(np.argmax(bad))
                 found.append(
-                    Violation(file=name, group=group, row=row, more=more, what=what, got=said)
+                    Violation(
+                        file=name,
+                        group=group,
+                        row=int(t[NUMBER][first]),
+                        more=int(bad.sum()) - 1,
+                        what=what,
+                        got=_said(np.asarray(got)[first]),
+                    )
                 )
                 sound &= ~bad
-        rows = rows.where(sound)
+        t = t[sound]
     return found
-
-
-def _read(file: Any, task: RowsTask) -> _Rows:
-    """Read the rows of a task."""
-    own, choice = file[task.group], slice(task.start, task.stop)
-    # The seal proves that images are intact, and no rule here is about their colours and depths.
-    fields = (f for f in task.fields if f.name in own and not (f.sample and f.limits is None))
-    return _Rows(
-        of=task,
-        numbers=np.arange(task.start, task.stop),
-        columns=Table({f.name: read_rows(own, f, choice) for f in fields}),
-        attributes=dict(file.attrs),
-    )
 
 
 def _said(value: Any) -> str:
@@ -250,36 +184,64 @@ def _any(values: AnyArray) -> AnyArray:
     return np.asarray(values.any(axis=tuple(range(1, values.ndim))))
 
 
+def _read_fields(t: Table, task: RowsTask) -> Iterator[Field]:
+    """Yield the fields that were read."""
+    return (f for f in task.fields if t.has(f.name))
+
+
 # What the table of fields says of any group
 
 
-def _numbers(rows: _Rows) -> Iterator[Finding]:
+def _numbers(t: Table, task: RowsTask) -> Iterator[Finding]:
     """Numbers of rows are those of rows, and codes have a meaning."""
-    group, counts = rows.of.group, rows.of.counts
-    if group == "trials":
-        values = rows["trial_id"]
-        yield "trial_id must be the number of the row", values != rows.numbers, values
-    for name, of in NUMBERS.get(group, {}).items():
-        values = rows[name]
-        bad = _any((values < 0) | (values >= counts.get(of, np.inf)))
+    if task.group == "trials":
+        values = t["trial_id"]
+        yield "trial_id must be the number of the row", values != t[NUMBER], values
+    for name, of in NUMBERS.get(task.group, {}).items():
+        values = t[name]
+        bad = _any((values < 0) | (values >= task.counts.get(of, np.inf)))
         yield f"{name} must be one of the rows of /{of}", bad, values
     for (place, name), known in CODES.items():
-        if place == group:
+        if place == task.group:
             what = f"{name} must be one of {', '.join(map(str, known))}"
-            yield what, ~np.isin(rows[name], known), rows[name]
+            yield what, ~np.isin(t[name], known), t[name]
 
 
-def _complete(rows: _Rows) -> Iterator[Finding]:
+def _stage(t: Table, task: RowsTask) -> AnyArray:
+    """Return the stage (n,) that each row reached; a sample reached the last one."""
+    if task.group != "trials":
+        return np.full(t.count, Stage.LIFTED.value)
+    stages = {outcome.value: outcome.stage.value for outcome in Outcome}
+    reached = np.array([stages[outcome] for outcome in t["outcome"].tolist()], dtype=int)
+    # The hand can touch the table while it closes, or in the lift.
+    late = (t["outcome"] == Outcome.TABLE_CONTACT) & np.isfinite(t["time_lift"])
+    return np.where(late, Stage.LIFTED.value, reached)
+
+
+def _touching(t: Table, task: RowsTask, field: Field) -> AnyArray:
+    """Return which fingers (n, k) have a contact at the time of a field."""
+    if task.group == "trials":
+        return t["lifted_touching" if "lifted" in field.name else "closed_touching"]
+    return ~unused_fingers(t["grasp_props/unused"], t["grasps"].shape[1] // 6)
+
+
+def _complete(t: Table, task: RowsTask) -> Iterator[Finding]:
     """Fields have values from their stage on, and no values before it."""
-    for f in rows.fields if rows.of.group in COMPLETE else ():
-        values, reached, since = rows[f.name], rows.stage >= f.stage, f.stage.name.lower()
+    if task.group not in COMPLETE:
+        return
+    stage = _stage(t, task)
+    for f in _read_fields(t, task):
+        values, reached, since = t[f.name], stage >= f.stage, f.stage.name.lower()
         if f.derive is not None or f.dtype == "str":
             continue  # see `_derived`
 
         # What a value must be depends on its kind.
         if not f.dtype.startswith("float"):
-            bad = ~reached & _any(values != 0)
-            yield f"{f.name} must be 0 before the stage {since}", bad, values
+            yield (
+                f"{f.name} must be 0 before the stage {since}",
+                ~reached & _any(values != 0),
+                values,
+            )
         elif f.some:
             bad = ~reached & _any(~np.isnan(values))
             yield f"{f.name} must be NaN before the stage {since}", bad, values
@@ -287,7 +249,7 @@ def _complete(rows: _Rows) -> Iterator[Finding]:
             late = f.stage is not Stage.PLACED
             due, where = reached, f"from the stage {since} on and NaN before" if late else "always"
             if f.per_finger or f.axes == ("6k",):
-                due = reached[:, None] & rows.touching(f)
+                due = reached[:, None] & _touching(t, task, f)
                 where = "where the finger touches and NaN elsewhere"
             if f.axes == ("6k",):
                 due = np.tile(np.repeat(due, 3, axis=1), 2)
@@ -296,12 +258,12 @@ def _complete(rows: _Rows) -> Iterator[Finding]:
             yield f"{f.name} must be finite {where}", bad, values
 
 
-def _limits(rows: _Rows) -> Iterator[Finding]:
+def _limits(t: Table, task: RowsTask) -> Iterator[Finding]:
     """Values are within the limits of their fields; NaN has no limits."""
-    for f in rows.fields:
+    for f in _read_fields(t, task):
         if f.limits is not None:
             # A limit is rounded as the values are: in float32, pi is above its double value.
-            values = rows[f.name].reshape(len(rows.numbers), -1)
+            values = t[f.name].reshape(t.count, -1)
             low, high = (values.dtype.type(limit) for limit in f.limits)
             positive = f.limits[0] == POSITIVE
             what = f"above 0..{high:.4g}" if positive else f"{low:g}..{high:.4g}"
@@ -310,32 +272,32 @@ def _limits(rows: _Rows) -> Iterator[Finding]:
             yield f"{f.name} must be {what}", bad.any(axis=1), worst
 
 
-def _rigid(rows: _Rows) -> Iterator[Finding]:
+def _rigid(t: Table, task: RowsTask) -> Iterator[Finding]:
     """Poses are rigid motions, and normals have length one; NaN means that there is no value."""
-    count = len(rows.numbers)
-    for f in rows.fields:
+    count = t.count
+    for f in _read_fields(t, task):
         if f.axes[-1:] == (12,):
-            R = unpack_pose(rows[f.name].astype(float)).reshape(count, -1, 4, 4)[..., :3, :3]
+            R = unpack_pose(t[f.name].astype(float)).reshape(count, -1, 4, 4)[..., :3, :3]
             R = np.where(np.isfinite(R).all(axis=(2, 3), keepdims=True), R, np.eye(3))
             off = np.abs(np.swapaxes(R, 2, 3) @ R - np.eye(3)).max(axis=(1, 2, 3))
             bad = (off > UNIT_TOLERANCE) | (np.linalg.det(R).min(axis=1) < 0.0)
             what = f"{f.name} must have an orthonormal rotation with determinant +1"
-            yield what, bad, rows[f.name].reshape(count, -1)
+            yield what, bad, t[f.name].reshape(count, -1)
         elif f.axes == ("6k",) or (f.axes == ("k", 3) and "nhat" in f.name):
             # In a grasp the normals come after the points.
-            n = rows[f.name].astype(float).reshape(count, -1, 3)
+            n = t[f.name].astype(float).reshape(count, -1, 3)
             n = n[:, n.shape[1] // 2 :] if f.axes == ("6k",) else n
             length = np.linalg.norm(n, axis=2)
             bad = (np.abs(length - 1.0) > UNIT_TOLERANCE).any(axis=1)
             yield f"normals in {f.name} must have length 1", bad, length
 
 
-def _derived(rows: _Rows) -> Iterator[Finding]:
+def _derived(t: Table, task: RowsTask) -> Iterator[Finding]:
     """Derived fields have the values that the schema derives from other fields."""
-    for f in rows.fields:
-        if f.derive is not None and rows.columns.has(*f.needs):
+    for f in _read_fields(t, task):
+        if f.derive is not None and t.has(*f.needs):
             what = f"{f.name} must follow from {', '.join(f.needs)}"
-            yield what, _differs(rows[f.name], f.derive(rows.columns)), rows[f.name]
+            yield what, _differs(t[f.name], f.derive(t)), t[f.name]
 
 
 def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) -> AnyArray:
@@ -360,48 +322,64 @@ def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) ->
 # What samples are
 
 
-def _chain(rows: _Rows) -> Iterator[Finding]:
+def _pose(t: Table, name: str) -> Array:
+    """Return the poses (n, 4, 4) in a field of `object_props`."""
+    return unpack_pose(t[f"object_props/{name}"].astype(float))
+
+
+def _X_CW(t: Table, task: RowsTask) -> Array:
+    """Return the poses (n, 4, 4) of the world in the frame of the file's camera."""
+    return _pose(t, f"frame_cam2work_{task.attributes['camera']}") @ invert_pose(X_WT)
+
+
+def _contacts(t: Table) -> tuple[Array, Array]:
+    """Return p_CQ [m] and nhat_Q_C, (n, k, 3) each, of the closed hands."""
+    vectors = t["grasps"].astype(float).reshape(t.count, 2, -1, 3)
+    return vectors[:, 0], vectors[:, 1]
+
+
+def _chain(t: Table, task: RowsTask) -> Iterator[Finding]:
     """The frames of a sample agree: the table, and both cameras with their inverses."""
     what = f"frame_world2work must be the identity at {X_WT[:3, 3].tolist()} m"
-    apart = {what: rows.pose("frame_world2work") - X_WT}
+    apart = {what: _pose(t, "frame_world2work") - X_WT}
     for camera in CAMERAS:
         names = f"frame_work2cam_{camera}", f"frame_cam2work_{camera}"
-        X_TC, X_CT = map(rows.pose, names)
+        X_TC, X_CT = (_pose(t, name) for name in names)
         apart[f"{names[0]} times {names[1]} must be the identity"] = X_TC @ X_CT - np.eye(4)
-    oto, otm = (rows.pose(f"frame_work2cam_{camera}")[:, :3, 2:] for camera in CAMERAS)
+    oto, otm = (_pose(t, f"frame_work2cam_{camera}")[:, :3, 2:] for camera in CAMERAS)
     apart["both cameras must have the same place and view"] = oto - otm
     for what, difference in apart.items():
         off = np.abs(difference).max(axis=(1, 2))
         yield what, off > POSITION_TOLERANCE, off
 
 
-def _of_sample(rows: _Rows) -> Iterator[Finding]:
+def _of_sample(t: Table, task: RowsTask) -> Iterator[Finding]:
     """The trial of a sample is a success that no filter removes."""
-    kept = Trials(rows.of.path.parent)[rows["trial_id"]]["removal"] == Removal.KEPT
-    yield "trial_id must be that of a sample", ~kept, rows["trial_id"]
+    kept = Trials(task.path.parent)[t["trial_id"]]["removal"] == Removal.KEPT
+    yield "trial_id must be that of a sample", ~kept, t["trial_id"]
 
 
-def _as_in_trials(rows: _Rows) -> Iterator[Finding]:
+def _as_in_trials(t: Table, task: RowsTask) -> Iterator[Finding]:
     """A sample repeats the numbers of its trial, and its poses follow from those of the trial."""
-    copied = {f.name: f.of for f in rows.fields if f.of}
-    trials = Trials(rows.of.path.parent)[rows["trial_id"]]
+    copied = {f.name: f.of for f in _read_fields(t, task) if f.of}
+    trials = Trials(task.path.parent)[t["trial_id"]]
     own = Table(trials.columns([*copied.values(), "X_TO", "X_OG"]))
     for name, of in copied.items():
-        yield f"{name} must follow from its trial", _differs(rows[name], own[of]), rows[name]
+        yield f"{name} must follow from its trial", _differs(t[name], own[of]), t[name]
 
     X_WO = multiply(X_WT, unpack_pose(own["X_TO"]))
-    X_CG = rows.X_CW @ X_WO @ unpack_pose(own["X_OG"])
+    X_CG = _X_CW(t, task) @ X_WO @ unpack_pose(own["X_OG"])
     poses = {"object_props/frame_world2obj": X_WO, "grasp_props/X_CG": X_CG}
     for name, due in poses.items():
-        bad = _differs(rows[name], pack_pose(due), POSITION_TOLERANCE)
-        yield f"{name} must follow from its trial", bad, rows[name]
+        bad = _differs(t[name], pack_pose(due), POSITION_TOLERANCE)
+        yield f"{name} must follow from its trial", bad, t[name]
 
 
-def _in_mask(rows: _Rows) -> Iterator[Finding]:
+def _in_mask(t: Table, task: RowsTask) -> Iterator[Finding]:
     """Contacts are before the camera, and project onto the object in the image."""
-    (p_CQ, _), K = rows.contacts, rows.attributes["K"]
+    (p_CQ, _), K = _contacts(t), task.attributes["K"]
     off = np.zeros(p_CQ.shape[:2])
-    for i, mask in enumerate(rows["masks"]):
+    for i, mask in enumerate(t["masks"]):
         used, seen = np.isfinite(p_CQ[i]).all(axis=1), np.argwhere(mask)[:, ::-1]
         apart = np.linalg.norm(project(K, p_CQ[i, used])[:, None] - seen, axis=2)
         off[i, used] = apart.min(axis=1, initial=np.inf)
@@ -410,22 +388,22 @@ def _in_mask(rows: _Rows) -> Iterator[Finding]:
     yield what, np.any(off > MASK_TOLERANCE, axis=1), off
 
 
-def _on_mesh(rows: _Rows) -> Iterator[Finding]:
+def _on_mesh(t: Table, task: RowsTask) -> Iterator[Finding]:
     """Contacts are on the object's mesh, and their normals point out of it.
 
     A normal counts as outward if it agrees with either of the faces of `ContactFit.normal_angle`.
     """
-    assert rows.of.dataset is not None
-    limit = rows.of.dataset.config.filters.max_surface_distance
-    X_OC = invert_pose(rows.X_CW @ rows.pose("frame_world2obj"))
-    p_CQ, nhat_Q_C = rows.contacts
+    assert task.dataset is not None
+    limit = task.dataset.config.filters.max_surface_distance
+    X_OC = invert_pose(_X_CW(t, task) @ _pose(t, "frame_world2obj"))
+    p_CQ, nhat_Q_C = _contacts(t)
     off, angle = np.zeros((2, *p_CQ.shape[:2]))
 
     # Object by object.
-    names = rows["object_props/object_name"]
+    names = t["object_props/object_name"]
     for name in np.unique(names.astype(str)).tolist():
         try:
-            model = load_object(model_path(rows.of.path.parent, name))
+            model = load_object(model_path(task.path.parent, name))
         except (DataError, MeshError):
             continue  # a violation of the object's files
         for i in np.flatnonzero(names == name).tolist():

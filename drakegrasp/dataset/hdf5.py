@@ -7,24 +7,23 @@ with the same result; it is used if the package `deflate` is installed.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.dataset.schema import Field
 from drakegrasp.errors import DataError, first_line, printable
 from drakegrasp.foreign_files import NAME_RULE, is_name, refuse_irregular
+from drakegrasp.table import AnyArray as AnyArray
+from drakegrasp.table import Table
 
 try:
     import deflate
 except ModuleNotFoundError:
     deflate = None
 
-AnyArray = npt.NDArray[Any]
 #: Largest number of bytes that the compression of HDF5 packs into one byte (zlib: 1,032 to 1).
 MOST_PACKED = 1_032
 #: Level of compression: higher levels save a tenth of the bytes for twice the time.
@@ -147,16 +146,49 @@ def read_names(dataset: h5py.Dataset) -> tuple[str, ...]:
     return names
 
 
-def read_column(group: h5py.Group, name: str) -> AnyArray:
-    """Return a whole column of numbers, in a third of the time that `group[name][:]` takes.
+def read_columns(
+    group: h5py.Group,
+    fields: Sequence[Field],
+    names: Iterable[str] | None = None,
+    rows: slice = slice(None),
+) -> Table:
+    """Return columns (n, ...) of a group of any file: trials, samples, scenes, or a shard.
+
+    A column that the group lacks is derived from others, or empty if its field is optional.
+
+    Args:
+        group: The group.
+        fields: All fields of the group, from which the shape of an empty column follows.
+        names: Names of the columns; None for all fields.
+        rows: The rows.
 
     Raises:
-        OSError: If the column is missing or cannot be read.
+        DataError: If a column is missing.
+        OSError: If a column cannot be read.
     """
-    try:
-        column = h5py.h5d.open(group.id, name.encode())
-    except KeyError as error:
-        raise OSError(f"no column {name} ({error})") from None
+    known = {field.name: field for field in fields}
+    return Table({name: _column(group, known[name], rows, fields) for name in names or known})
+
+
+def _column(group: h5py.Group, field: Field, rows: slice, fields: Sequence[Field]) -> AnyArray:
+    if field.name in group:
+        return _stored(group, field.name, rows, text=field.dtype == "str")
+    if field.derive is not None and all(name in group for name in field.needs):
+        columns = {name: _stored(group, name, rows) for name in field.needs}
+        return field.derive(columns).astype(field.dtype, copy=False)
+    if not field.optional:
+        path = f"{group.name}/{field.name}"
+        raise DataError(f"{group.file.filename}: {path} must be there, got none")
+    (count, *_) = next(each.shape for each in group.values() if isinstance(each, h5py.Dataset))
+    return field.empty(len(range(count)[rows]), sizes_in(group, fields))
+
+
+def _stored(group: h5py.Group, name: str, rows: slice, *, text: bool = False) -> AnyArray:
+    """Return rows of a column; a whole one in a third of the time that `group[name][:]` takes."""
+    if text or rows != slice(None):
+        dataset = group[name]
+        return np.asarray((dataset.asstr() if text else dataset)[rows])
+    column = h5py.h5d.open(group.id, name.encode())
     values = np.empty(column.shape, dtype=column.dtype)
     try:
         if values.size:
@@ -164,36 +196,6 @@ def read_column(group: h5py.Group, name: str) -> AnyArray:
     except RuntimeError as error:
         raise OSError(str(error)) from None  # what HDF5 says of a damaged file
     return values
-
-
-def read_rows(
-    group: h5py.Group,
-    field: Field,
-    rows: slice = slice(None),
-    fields: Iterable[Field] = (),
-) -> AnyArray:
-    """Return rows (n, ...) of a field; a field missing in an older file is derived or empty.
-
-    Args:
-        group: The group of the field.
-        field: The field.
-        rows: The rows.
-        fields: Other fields of the group. A missing field without values gets its shape, such as
-            (n, k), from those of them that exist.
-
-    Raises:
-        DataError: If the field is required and missing.
-    """
-    if field.name in group:
-        dataset = group[field.name]
-        return np.asarray((dataset.asstr() if field.dtype == "str" else dataset)[rows])
-    if not field.optional:
-        path = f"{group.name}/{field.name}"
-        raise DataError(f"{group.file.filename}: {path} must be there, got none")
-    if field.derive is not None and all(name in group for name in field.needs):
-        return field.derive({name: group[name][rows] for name in field.needs})
-    (count, *_) = next(each.shape for each in group.values() if isinstance(each, h5py.Dataset))
-    return field.empty(len(range(count)[rows]), sizes_in(group, fields))
 
 
 def sizes_in(group: h5py.Group, fields: Iterable[Field]) -> dict[str, int]:
@@ -314,25 +316,12 @@ class ImageRows:
         Raises:
             OSError: If the chunk is damaged.
         """
-        image = np.empty(self._shape, dtype=self._dataset.dtype)
-        self.read_into(row, image)
-        return image
-
-    def read_into(self, row: int, image: AnyArray) -> None:
-        """Read the image of a row.
-
-        Args:
-            row: Row of the field.
-            image: Contiguous array of an image's shape and type; it is overwritten.
-
-        Raises:
-            OSError: If the chunk is damaged.
-        """
         chunk = self._chunk(row) if self._inflated_here else None
         if chunk is None:
-            image[...] = self._dataset[row]
-        else:
-            _unshuffle(self._inflate(chunk, row), image)
+            return np.asarray(self._dataset[row])
+        image = np.empty(self._shape, dtype=self._dataset.dtype)
+        _unshuffle(self._inflate(chunk, row), image)
+        return image
 
     def _chunk(self, row: int) -> bytes | None:
         """Return the stored bytes of a row; None if a filter was skipped, or nothing is stored."""

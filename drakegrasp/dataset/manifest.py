@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -55,12 +54,8 @@ from drakegrasp.runtime.files import probe_folder, write_atomic
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
-#: Versions that must not change within a dataset, nor differ between a client and its workers. The
-#: version of drakegrasp may differ if both versions produce the same results.
+#: Versions that must not change within a dataset, nor differ between a client and its workers.
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
-#: The oldest version of drakegrasp whose results equal those of this one. A change after which the
-#: same settings produce other values sets it to the version in which the change is released.
-RESULTS_SINCE = "0.6.0"
 
 
 def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
@@ -199,7 +194,7 @@ class Manifest:
         rejected: Attempts that an inspection rejects: successes that are not samples.
         versions: Versions of the packages that built the dataset, and a hash of the hand's files.
         fingers: Names of the fingers in grasp order, each with whether a grasp needs its fingertip.
-        joints: Names of the hand's joints in the order of the fields `q`; empty in older datasets.
+        joints: Names of the hand's joints in the order of the fields `q`.
         schema_version: Version of the schema of the dataset's files.
     """
 
@@ -271,19 +266,7 @@ def package_versions() -> dict[str, str]:
 
 def other_version(then: Mapping[str, str], now: Mapping[str, str]) -> str | None:
     """Return the first of `REQUIRED_VERSIONS` by which results may differ, or None."""
-    pairs = ((name, then.get(name, ""), now.get(name, "")) for name in REQUIRED_VERSIONS)
-    return next((name for name, a, b in pairs if not same_results(name, a, b)), None)
-
-
-def same_results(name: str, *versions: str) -> bool:
-    """Return whether versions of a package are equal, or are ours and produce equal results."""
-    since, *numbers = (
-        [int(number) for number in re.findall(r"\d+", text)[:3]]
-        for text in (RESULTS_SINCE, *versions, metadata.version("drakegrasp"))
-    )
-    *theirs, now = numbers
-    ours = name == "drakegrasp" and all(since <= version <= now for version in theirs)
-    return len(set(versions)) == 1 or ours
+    return next((n for n in REQUIRED_VERSIONS if then.get(n, "") != now.get(n, "")), None)
 
 
 def origin_attributes(
@@ -298,7 +281,7 @@ def origin_attributes(
         "seed": config.seed,
         "versions": json.dumps(versions, sort_keys=True),
         "fingers": json.dumps(dict(fingers)),
-        **({"joints": json.dumps(list(joints))} if joints else {}),
+        "joints": json.dumps(list(joints)),
     }
 
 
@@ -329,7 +312,7 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "split_by": manifest.config.split.by,
         "versions": manifest.versions,
         "fingers": manifest.fingers,
-        **({"joints": list(manifest.joints)} if manifest.joints else {}),
+        "joints": list(manifest.joints),
         "objects": [entry.to_json() for entry in manifest.objects],
         "refused": [stated(entry) for entry in manifest.refused],
     }

@@ -9,13 +9,12 @@ NumPy and h5py.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
@@ -65,13 +64,11 @@ class Difference:
         path: Path of the group or the dataset; empty for the whole file.
         what: What the file must have there, in words.
         got: What the file has there instead.
-        text_only: Whether only descriptions differ, not values: the rows can be read.
     """
 
     path: str = ""
     what: str
     got: str
-    text_only: bool = False
 
     def __str__(self) -> str:
         return f"{self.path + ': ' if self.path else ''}{self.what}, got {self.got}"
@@ -107,11 +104,11 @@ def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]
 
 @contextmanager
 def _opened_whole(
-    path: Path, what: str, rules: Mapping[str, Rule], tables: Tables
+    path: Path, what: str, kinds: Mapping[str, Kind], tables: Tables
 ) -> Iterator[h5py.File]:
     """Open a file, see `opened`, and reject it if it differs from the schema."""
     with opened(path, what) as file:
-        refuse_other_attributes(path, file, rules)
+        refuse_other_attributes(path, file, kinds)
         refuse_first(path, differences(file, tables))
         yield file
 
@@ -168,78 +165,30 @@ def refuse_other_codes(
 
 # Attributes
 
-#: A rule: a description of the valid values, and a function that checks a value.
-Rule = tuple[str, Callable[[Any], bool]]
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
-
-
-def _is_json(
-    kind: type[dict[str, Any] | list[Any]], each: Callable[[Any], bool] = lambda value: True
-) -> Callable[[Any], bool]:
-    """Return a check for JSON text that holds a mapping or a list of such values."""
-
-    def obeys(value: Any) -> bool:
-        try:
-            tree = parse_json(value) if isinstance(value, str) else None
-        except ValueError:
-            return False
-        if not isinstance(tree, kind):
-            return False
-        return all(map(each, tree.values() if isinstance(tree, dict) else tree))
-
-    return obeys
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
-
-
-def _is_matrix(value: Any) -> bool:
-    is_array = isinstance(value, np.ndarray) and value.shape == (3, 3) and value.dtype.kind == "f"
-    return is_array and bool(np.isfinite(value).all())
-
-
-TEXT: Rule = ("a text", _is_text)
-COUNT: Rule = ("a whole number that is not negative", _is_whole)
-#: Rules of the attributes of all three files.
-ORIGIN: Mapping[str, Rule] = {
-    **dict.fromkeys(("config", "versions"), ("a mapping in JSON", _is_json(dict))),
-    **dict.fromkeys(("config_hash", "signature", "shards"), TEXT),
-    "seed": COUNT,
-    "fingers": (
-        "whether a grasp needs each finger, in JSON",
-        _is_json(dict, lambda value: isinstance(value, bool)),
-    ),
-    "joints": ("names of the hand's joints, in JSON", _is_json(list, _is_text)),
-    "K": ("a matrix of 3 x 3 finite numbers", _is_matrix),
-    **dict.fromkeys(
-        ("near", "far"),
-        (
-            "a positive number",
-            lambda v: isinstance(v, float | np.floating) and bool(0.0 < v < np.inf),
-        ),
-    ),
+#: What an attribute holds: one of the keys of _KINDS, or one of some texts.
+Kind = type | str | tuple[str, ...]
+MATRIX = "matrix"
+#: Attributes of all three files.
+ORIGIN: Mapping[str, Kind] = {
+    **dict.fromkeys(("config", "versions", "fingers"), dict),
+    **dict.fromkeys(("config_hash", "signature", "shards"), str),
+    "joints": list,
+    "seed": int,
+    "K": MATRIX,
+    "near": float,
+    "far": float,
 }
-#: Attributes that files from older versions may lack.
-_YOUNG = ("fingers", "joints", "split_by")
-#: Rules of the attributes of the data files.
-OF_CAMERA: Mapping[str, Rule] = {
-    **ORIGIN,
-    "camera": (f"one of {', '.join(CAMERAS)}", lambda v: isinstance(v, str) and v in CAMERAS),
-    "split_by": ("class or object", lambda v: isinstance(v, str) and v in ("class", "object")),
-}
-#: Rules of the attributes of scenes.hdf5, whose views have their own camera matrices.
-OF_SCENES: Mapping[str, Rule] = {key: rule for key, rule in ORIGIN.items() if key != "K"}
+#: Attributes of the data files.
+OF_CAMERA: Mapping[str, Kind] = {**ORIGIN, "camera": CAMERAS, "split_by": ("class", "object")}
+#: Attributes of scenes.hdf5, whose views have their own camera matrices.
+OF_SCENES: Mapping[str, Kind] = {key: kind for key, kind in ORIGIN.items() if key != "K"}
 
 #: Context managers that open a file of a dataset, given its path: grasping_oto.hdf5 or
 #: grasping_otm.hdf5, trials.hdf5, scenes.hdf5. They raise a DataError if the file is missing,
 #: damaged, or differs from the schema.
 open_samples, open_trials, open_scenes = (
-    partial(_opened_whole, what=what, rules=rules, tables=tables)
-    for what, rules, tables in (
+    partial(_opened_whole, what=what, kinds=kinds, tables=tables)
+    for what, kinds, tables in (
         ("a data file of drakegrasp", OF_CAMERA, DATA_TABLES),
         ("the trials of a dataset", ORIGIN, TRIAL_TABLES),
         ("the scenes of a dataset", OF_SCENES, SCENE_TABLES),
@@ -247,31 +196,47 @@ open_samples, open_trials, open_scenes = (
 )
 
 
-def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> dict[str, Difference]:
-    """Return the attributes that are missing or break their rules, by name.
-
-    Args:
-        file: The file.
-        rules: Rules by the attributes' names.
-    """
-    mistakes = {}
-    for key, (must, obeys) in rules.items():
+def attribute_mistakes(file: h5py.File, kinds: Mapping[str, Kind]) -> Iterator[Difference]:
+    """Yield the attributes of a file that are missing or hold something else."""
+    for key, kind in kinds.items():
         value = file.attrs.get(key)
-        if key not in file.attrs and key not in _YOUNG:
-            mistakes[key] = Difference(what=f"attribute {key} must be {must}", got="none")
-        elif key in file.attrs and not obeys(value):
-            got = printable(" ".join(repr(value).split())[:60])
-            mistakes[key] = Difference(what=f"attribute {key} must be {must}", got=got)
-    return mistakes
+        if not _holds(value, kind):
+            must = _KINDS[kind] if isinstance(kind, type | str) else f"one of {', '.join(kind)}"
+            got = printable(" ".join(repr(value).split())[:60]) if key in file.attrs else "none"
+            yield Difference(what=f"attribute {key} must be {must}", got=got)
 
 
-def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rule]) -> None:
-    """Reject a file of another schema version, or with an attribute that breaks its rule.
+#: The kinds in words.
+_KINDS: Mapping[Any, str] = {
+    str: "a text",
+    dict: "a mapping in JSON",
+    list: "a list in JSON",
+    int: "a whole number that is not negative",
+    float: "a positive number",
+    MATRIX: "a matrix of 3 x 3 numbers",
+}
 
-    Args:
-        path: Path of the file, for the message.
-        file: The file.
-        rules: Rules by the attributes' names.
+
+def _holds(value: Any, kind: Kind) -> bool:
+    """Return whether an attribute holds a value of its kind."""
+    if kind is int:
+        return isinstance(value, np.integer) and bool(value >= 0)
+    if kind is float:
+        return isinstance(value, np.floating) and bool(value > 0.0)
+    if kind == MATRIX:
+        return isinstance(value, np.ndarray) and value.shape == (3, 3) and value.dtype.kind == "f"
+    if not isinstance(value, str) or kind is str:
+        return isinstance(value, str) and value.isprintable()
+    if isinstance(kind, tuple):
+        return value in kind
+    try:
+        return type(parse_json(value)) is kind
+    except ValueError:
+        return False
+
+
+def refuse_other_attributes(path: Path, file: h5py.File, kinds: Mapping[str, Kind]) -> None:
+    """Reject a file of another schema version, or with an attribute of another kind.
 
     Raises:
         DataError: If the file is rejected; the error reports the first mistake.
@@ -281,166 +246,60 @@ def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rul
     if "schema_version" not in file.attrs:
         raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
     refuse_other_schema(path, file.attrs["schema_version"])
-    refuse_first(path, attribute_mistakes(file, rules).values())
+    refuse_first(path, attribute_mistakes(file, kinds))
 
 
 # Groups and datasets
 
 
-def differences(file: h5py.File, tables: Tables, *, thorough: bool = False) -> Iterator[Difference]:
-    """Yield the differences between the groups and datasets of a file and the schema.
+def differences(file: h5py.File, tables: Tables) -> Iterator[Difference]:
+    """Yield the differences between the groups and datasets of a file and their fields.
 
-    Args:
-        file: The file.
-        tables: Fields of each group; the fields of the whole file are under "/".
-        thorough: Whether to report harmless differences as well: additional fields, and other
-            attributes of fields.
+    The first dataset of a group tells the number of its rows, and the first field with a letter in
+    its shape the length of this letter in the file.
     """
-    # The headers of all datasets; each is read once.
-    headers = {name: _datasets(file, name, fields) for name, fields in tables.items()}
-    lengths = _lengths(tables, headers)
-    if thorough:
-        yield from _extras(file, tables)
+    lengths: dict[str, int] = {}
     for name, fields in tables.items():
-        datasets, place = headers[name], f"/{name}".rstrip("/")
-        if datasets is None:
+        group, place, rows = file.get(name), f"/{name}".rstrip("/"), None
+        if not isinstance(group, h5py.Group):
             yield Difference(path=place, what="the group must be there", got="none")
             continue
-
-        # Check each field by itself; the number of rows must be that of most datasets.
-        meanings = {f.meaning: f.name for f in fields}
-        rows = _most_frequent([each.shape[0] for each in datasets.values() if each.shape])
         for f in fields:
-            path, header = f"{place}/{f.name}", datasets.get(f.name)
-            if header is not None:
-                yield from _of_field(path, header, f, rows, lengths)
-                yield from _of_words(path, header.dataset, f, meanings, thorough)
-            elif not f.optional or f.name in file[name]:
-                yield Difference(path=path, what="the dataset must be there", got="none")
+            path, found = f"{place}/{f.name}", _dataset(group, f.name)
+            if found is None:
+                if not f.optional or f.name in group:
+                    yield Difference(path=path, what="the dataset must be there", got="none")
+                continue
+            dtype, shape = found.dtype, found.shape
+            text = h5py.check_string_dtype(dtype) is not None
+            if text != (f.dtype == "str") or not (text or dtype == np.dtype(f.dtype)):
+                yield Difference(path=path, what=f"type must be {f.dtype}", got=str(dtype))
+            rows = shape[0] if rows is None and shape else rows
+            due = (rows or 0, *_row_shape(f, shape, lengths))
+            if shape != due:
+                yield Difference(path=path, what=f"shape must be {due}", got=str(shape))
 
 
-class _Header(NamedTuple):
-    """A dataset, its type, and its shape, which is None without a dataspace."""
-
-    dataset: h5py.h5d.DatasetID
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...] | None
-
-
-def _datasets(file: h5py.File, name: str, fields: Iterable[Field]) -> dict[str, _Header] | None:
-    """Return the datasets of a group that are fields; None if the group does not exist."""
-    group = file.get(name)
-    if not isinstance(group, h5py.Group):
-        return None
-    datasets = {}
-    for f in fields:
-        try:
-            item = h5py.h5o.open(group.id, f.name.encode())
-        except KeyError:
-            continue
-        if isinstance(item, h5py.h5d.DatasetID):
-            datasets[f.name] = _Header(item, item.dtype, item.shape)
-    return datasets
-
-
-def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
-    """Yield a difference for each group and dataset that is not in the schema."""
-    for extra in sorted(set(file) - set(tables)):
-        yield Difference(what="groups must be those of the schema", got=f"/{extra} too")
-    for name, fields in tables.items():
-        group, paths = file.get(name), list[str]()
-        if isinstance(group, h5py.Group):
-            group.visititems(
-                lambda path, node, paths=paths: (
-                    paths.append(path) if isinstance(node, h5py.Dataset) else None
-                )
-            )
-        for key in sorted(set(paths) - {f.name for f in fields}):
-            what = "datasets must be those of the schema"
-            yield Difference(path=f"/{name}", what=what, got=f"{key} too")
-
-
-def _lengths(tables: Tables, headers: Mapping[str, dict[str, _Header] | None]) -> dict[str, int]:
-    """Return the lengths of the letters in shapes, as most datasets of a file have them."""
-    votes: dict[str, list[int]] = {}
-    for name, fields in tables.items():
-        datasets = headers[name] or {}
-        for f in fields:
-            shape = datasets[f.name].shape if f.name in datasets else None
-            if shape and len(shape) == 1 + len(f.axes):
-                for axis, length in zip(f.axes, shape[1:], strict=True):
-                    letter, each = ("k", 6) if axis == "6k" else (str(axis), 1)
-                    votes.setdefault(letter, []).append(length // each)
-    known = {letter: _most_frequent(lengths) for letter, lengths in votes.items()}
-    known["6k"] = 6 * known.get("k", 0)
-    return {letter: length for letter, length in known.items() if length}
-
-
-def _most_frequent(numbers: Sequence[int]) -> int:
-    return Counter(numbers).most_common(1)[0][0] if numbers else 0
-
-
-def _of_field(
-    path: str,
-    header: _Header,
-    field: Field,
-    rows: int,
-    lengths: Mapping[str, int],
-) -> Iterator[Difference]:
-    """Yield the differences between the type and shape of a dataset and its field.
-
-    Args:
-        path: Path of the dataset.
-        header: The dataset.
-        field: The field.
-        rows: Number of rows that the dataset must have.
-        lengths: Lengths of the letters in the shapes, as far as they are known.
-    """
-    _, dtype, stored = header
-    text = h5py.check_string_dtype(dtype) is not None
-    if text != (field.dtype == "str") or not (text or dtype == np.dtype(field.dtype)):
-        yield Difference(path=path, what=f"type must be {field.dtype}", got=str(dtype))
+def _dataset(group: h5py.Group, name: str) -> h5py.h5d.DatasetID | None:
+    """Return a dataset of a group, or None; much faster than `group[name]`."""
     try:
-        shape = (rows, *field.row_shape(lengths))
+        item = h5py.h5o.open(group.id, name.encode())
     except KeyError:
-        # No sound dataset determines the letter; a dataset without a dataspace has no shape.
-        shape = (rows, *(stored or ())[1:])
-    if stored != shape:
-        yield Difference(path=path, what=f"shape must be {shape}", got=str(stored))
+        return None
+    return item if isinstance(item, h5py.h5d.DatasetID) else None
 
 
-def _of_words(
-    path: str,
-    dataset: h5py.h5d.DatasetID,
-    field: Field,
-    meanings: Mapping[str, str],
-    thorough: bool,
-) -> Iterator[Difference]:
-    """Yield the differences between the attributes of a dataset and its field.
-
-    Args:
-        path: Path of the dataset.
-        dataset: The dataset.
-        field: The field.
-        meanings: Names of the fields of the group by their meanings.
-        thorough: Whether unit and frame must also match the field, and a meaning must exist.
-    """
-    # Wording may improve without a new version of the schema. Only the meaning of another field is
-    # reported, because two fields were swapped then.
-    attrs = h5py.AttributeManager(h5py.Dataset(dataset))  # each is read when it is used
-    said = attrs.get("meaning")
-    if isinstance(said, str) and said != field.meaning and said in meanings:
-        yield Difference(path=path, what=f"must be {field.name}", got=meanings[said])
-    if not thorough:
-        return
-    for key, value in (("unit", field.unit), ("frame", field.frame)):
-        got = attrs.get(key)
-        if not (isinstance(got, str) and got == value):
-            what = f"attribute {key} must be {value!r}"
-            yield Difference(path=path, what=what, got=repr(got), text_only=True)
-    if not str("" if said is None else said):
-        what = "attribute meaning must be there"
-        yield Difference(path=path, what=what, got="none", text_only=True)
+def _row_shape(
+    field: Field, shape: tuple[int, ...] | None, lengths: dict[str, int]
+) -> tuple[int, ...]:
+    """Return the shape of a field's row; a letter that is not known yet gets its length here."""
+    if shape is not None and len(shape) == 1 + len(field.axes):
+        for axis, length in zip(field.axes, shape[1:], strict=True):
+            letter, each = ("k", 6) if axis == "6k" else (axis, 1)
+            if isinstance(letter, str):
+                lengths.setdefault(letter, length // each)
+    known = {**lengths, "6k": 6 * lengths.get("k", 0)}
+    return tuple(known.get(axis, 0) if isinstance(axis, str) else axis for axis in field.axes)
 
 
 # Plans
@@ -475,9 +334,9 @@ POSTURE_FIELDS = (
 )
 #: Lists of texts in JSON; `preshape` is left out if all its texts are empty.
 POSTURE_TEXTS = (_array("said", "", "uint8"), _array("preshape", "", "uint8", optional=True))
-_PLAN_ATTRIBUTES = {
-    **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
-    "asked": COUNT,
+_PLAN_ATTRIBUTES: Mapping[str, Kind] = {
+    **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), str),
+    "asked": int,
 }
 
 
@@ -487,7 +346,7 @@ def refuse_other_plan(path: Path, file: h5py.File) -> None:
     Raises:
         DataError: If the file is rejected; the error reports the first difference.
     """
-    refuse_first(path, attribute_mistakes(file, _PLAN_ATTRIBUTES).values())
+    refuse_first(path, attribute_mistakes(file, _PLAN_ATTRIBUTES))
     resting, palms = PLAN_TABLES
     tables = [resting, palms]
     if "q_grasp" in file:

@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, read_rows, says_damage, write_field
+from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, read_columns, says_damage, write_field
 from drakegrasp.dataset.opening import open_samples
 from drakegrasp.dataset.remote import local_file
 from drakegrasp.dataset.schema import DATA_FIELDS, PREDICTED_ROW_FIELDS, SPLITS
@@ -207,26 +207,6 @@ class GraspDataset:
         except Exception as error:
             raise self._as_damage(error) from None
 
-    def read_images(self, name: str, rows: Sequence[int], images: npt.NDArray[Any]) -> None:
-        """Read images of some rows directly into an array.
-
-        Args:
-            name: Name of the field, `images` or `masks`.
-            rows: n rows, in any order.
-            images: Contiguous array (n, ...) of the field's type; it is overwritten.
-
-        Raises:
-            DataError: If the field is not a field of images.
-        """
-        field = self._field(name)
-        if not isinstance(field, ImageRows):
-            raise DataError(f"field must be one of images, masks, got {name!r}")
-        try:
-            for image, row in zip(images, rows, strict=True):
-                field.read_into(row, image)
-        except Exception as error:
-            raise self._as_damage(error) from None
-
     def column(self, name: str) -> npt.NDArray[Any]:
         """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
 
@@ -244,7 +224,7 @@ class GraspDataset:
         _refuse_other_fields([name])
         group = self._open()[self.split]
         try:
-            return read_rows(group, FIELDS[name], slice(start, stop), FIELDS.values())
+            return read_columns(group, DATA_FIELDS, (name,), slice(start, stop))[name]
         except Exception as error:
             raise self._as_damage(error) from None
 
@@ -277,7 +257,7 @@ class GraspDataset:
         if name not in self._fields:
             field = group.get(name)
             if field is None:
-                field = read_rows(group, FIELDS[name], fields=FIELDS.values())
+                field = read_columns(group, DATA_FIELDS, (name,))[name]
             self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
         return self._fields[name]
 

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
-from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_rows, read_texts
+from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_columns, read_texts
 from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset, emptiness_of
 from drakegrasp.dataset.remote import local_file
@@ -168,9 +168,7 @@ class SceneDataset:
                 read_texts(file["objects"][key]) for key in ("name", "class_name")
             )
             self.tables: Mapping[str, Mapping[str, AnyArray]] = {
-                group: {
-                    f.name: read_rows(file[group], f, fields=fields) for f in fields if not f.sample
-                }
+                group: read_columns(file[group], fields, [f.name for f in fields if not f.sample])
                 for group, fields in SCENE_TABLES.items()
                 if group not in ("objects", "visible")
             }

@@ -6,7 +6,7 @@ the change of any single bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,16 +14,14 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import AnyArray, read_column, sizes_in, write_fixed
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, write_fixed
 from drakegrasp.dataset.opening import (
-    COUNT,
-    TEXT,
-    Tables,
+    Kind,
     differences,
     opened,
+    read_codes,
     refuse_first,
     refuse_other_attributes,
-    refuse_other_codes,
 )
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS, Field
@@ -33,9 +31,9 @@ from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
 #: Fields of `/trials` that are known for the whole dataset only; shards do not have them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
-_ATTRIBUTES = {
-    **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), TEXT),
-    **dict.fromkeys(("start", "stop"), COUNT),
+_ATTRIBUTES: Mapping[str, Kind] = {
+    **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), str),
+    **dict.fromkeys(("start", "stop"), int),
 }
 
 
@@ -107,17 +105,6 @@ def trial_columns() -> tuple[Field, ...]:
     return tuple(f for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS and f.derive is None)
 
 
-def read_field(trials: h5py.Group, field: Field) -> AnyArray:
-    """Return a column of a shard's `/trials`; a missing optional column is filled with no-value.
-
-    Raises:
-        OSError: If the column is missing or cannot be read.
-    """
-    if field.optional and field.name not in trials:
-        return field.empty(len(trials["outcome"]), sizes_in(trials, trial_columns()))
-    return read_column(trials, field.name)
-
-
 def write_shard(out: Path, shard: Shard) -> Path:
     """Write a shard into a dataset's directory and return its path."""
     path = shard.header.path(out)
@@ -150,33 +137,15 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
     with open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
         return Shard(
             header=own_header,
-            trials={f.name: read_field(file["trials"], f) for f in trial_columns()},
-            looks={f.name: read_column(file["looks"], f.name) for f in LOOK_FIELDS},
+            trials=read_columns(file["trials"], trial_columns()),
+            looks=read_columns(file["looks"], LOOK_FIELDS),
         )
-
-
-def read_trials(path: Path, header: ShardHeader, names: Sequence[str]) -> dict[str, AnyArray]:
-    """Return some columns of a shard's `/trials`, by their names.
-
-    Args:
-        path: Path of the file.
-        header: Identity that the shard must have.
-        names: Names of the columns.
-
-    Raises:
-        DataError: See `read_shard`.
-    """
-    columns = tuple(f for f in trial_columns() if f.name in (*names, "outcome"))
-    with open_shard(path, header, {"trials": columns}) as (file, _):
-        refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
-        return {name: read_column(file["trials"], name) for name in names}
 
 
 @contextmanager
 def open_shard(
     path: Path,
     header: ShardHeader | None,
-    tables: Tables | None = None,
     *,
     verify_seal: bool = True,
     again: bool = False,
@@ -186,8 +155,6 @@ def open_shard(
     Args:
         path: Path of the file.
         header: Identity that the shard must have; any if None.
-        tables: Fields that must exist; if None, all fields must exist, and outcomes and row numbers
-            must be valid.
         verify_seal: Whether to verify the seal first, which reads the whole file.
         again: Whether the same work has opened the shard before; then only its identity is checked.
 
@@ -212,13 +179,10 @@ def open_shard(
                 f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
             )
 
-        # Check the columns.
+        # Check the columns, outcomes and row numbers.
         if not again:
-            every = {"trials": trial_columns(), "looks": LOOK_FIELDS}
-            refuse_first(path, differences(file, every if tables is None else tables))
-        if not again and tables is None:
-            outcomes = read_column(file["trials"], "outcome")
-            refuse_other_codes(path, "/trials/outcome", outcomes, list(Outcome))
-            looked = read_column(file["looks"], "row")
-            refuse_other_codes(path, "/looks/row", looked, len(outcomes))
+            tables = {"trials": trial_columns(), "looks": LOOK_FIELDS}
+            refuse_first(path, differences(file, tables))
+            outcomes = read_codes(file["trials/outcome"], list(Outcome))
+            read_codes(file["looks/row"], len(outcomes))
         yield file, own_header

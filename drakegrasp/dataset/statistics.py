@@ -7,7 +7,7 @@ which objects have no sample, which part of a split is too small, and what would
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,12 +20,13 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config, SplitConfig, ways_to_grasps
 from drakegrasp.dataset.assembly.survey import shards_sha256
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
+from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_columns, read_names
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.opening import open_samples, open_trials
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
-from drakegrasp.dataset.trials import NONE, Trials, shard_part
+from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.shards import open_shard
+from drakegrasp.dataset.trials import NONE, Trials
 from drakegrasp.distinct import (
     BANDS,
     approach_cells,
@@ -38,7 +39,6 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.runtime.executor import Executor, run_here
 
 #: Name shown for postures without a preshape, for which all fingers close.
 NO_NAME = "-"
@@ -132,13 +132,12 @@ class Unfinished:
     total: int | None
 
 
-def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = run_here) -> bool:
+def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     """Return whether the three files exist and are what assembling would write now.
 
     Args:
         out: Directory of the dataset.
         verify_shards: Whether to compare the shards as well, which opens each of them.
-        execute: Executor that reads the shards.
 
     Raises:
         DataError: If a file stores values outside of itself, or a shard is missing.
@@ -146,7 +145,7 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
     manifest = read_manifest(out)
     expected = {"signature": manifest.signature()}
     if verify_shards:
-        expected["shards"] = shards_sha256(out, manifest, execute)
+        expected["shards"] = shards_sha256(out, manifest)
     try:
         for name in ASSEMBLED_FILES:
             with open_hdf5(out / name) as file:
@@ -199,26 +198,27 @@ def count_unfinished(out: Path) -> Unfinished | None:
     if is_assembled(out):
         return None
 
-    # Count the attempts of the complete shards.
+    # Count the attempts of the complete shards; no success is a sample yet.
     manifest = read_manifest(out)
     entries = manifest.objects
-    numbers = {entry.name: number for number, entry in enumerate(entries)}
-    parts = []
+    funnel, done = _empty_funnel([e.name for e in entries], [e.class_name for e in entries]), 0
     for header in manifest.headers():
-        with suppress(DataError):
-            parts.append(shard_part(out, header, numbers[header.object_name], _COUNTED))
-    objects = {
-        key: np.array([getattr(entry, key) for entry in entries]) for key in ("name", "class_name")
-    }
-    funnel = funnel_of(Trials.of_parts(out, objects, parts))
+        path = header.path(out)
+        with suppress(DataError), open_shard(path, header, verify_seal=False) as (file, _):
+            names = [name for name in _COUNTED if name not in ("object", "removal")]
+            block = read_columns(file["trials"], TRIAL_FIELDS, names)
+            number = np.full(block.count, funnel.names.index(header.object_name))
+            removal = np.full(block.count, NONE)
+            _count_block(funnel, block.with_columns(object=number, removal=removal))
+            done += 1
 
     # A build with a target tries as many palm poses as it needs. Without one, those that are still
     # to be tried count as well.
     if manifest.config.has_target and any(entry.tried is None for entry in entries):
-        return Unfinished(funnel=funnel, done=len(parts), total=None)
+        return Unfinished(funnel=funnel, done=done, total=None)
     planned = np.array([entry.candidates for entry in entries], dtype=np.int64)
     funnel = replace(funnel, candidates=planned)
-    return Unfinished(funnel=funnel, done=len(parts), total=manifest.units)
+    return Unfinished(funnel=funnel, done=done, total=manifest.units)
 
 
 def count_funnel(out: Path) -> Funnel:
@@ -232,40 +232,9 @@ def count_funnel(out: Path) -> Funnel:
 
 def funnel_of(trials: Trials) -> Funnel:
     """Return the funnel of attempts, see `count_funnel`."""
-    objects, count = trials.objects, len(trials.objects["name"])
-
-    def zeros(*shape: int) -> npt.NDArray[np.int64]:
-        return np.zeros(shape, dtype=np.int64)
-
-    funnel = Funnel(
-        names=tuple(objects["name"].tolist()),
-        classes=tuple(objects["class_name"].tolist()),
-        candidates=zeros(count),
-        outcomes=zeros(count, 1 + max(Outcome)),
-        precision=zeros(count),
-        stable=zeros(count),
-        removals=zeros(count, 1 + max(Removal)),
-        elevations=zeros(count, len(BANDS)),
-        approach_cells=zeros(count),
-        preshapes=zeros(1 + NO_PRESHAPE, 4),
-    )
+    funnel = _empty_funnel(*(trials.objects[key].tolist() for key in ("name", "class_name")))
     for block in trials.blocks(_COUNTED):
-        number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
-        held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
-        stable, preshape = block["stable"], block["preshape"]
-
-        # Palm poses, outcomes, labels of the hold, removals, and preshapes.
-        _count(funnel.candidates, number[block["standoff_index"] == 0])
-        _count(funnel.outcomes, (number, outcome))
-        _count(funnel.precision, number[block["precision"]])
-        _count(funnel.stable, number[stable])
-        decided = removal != NONE
-        _count(funnel.removals, (number[decided], removal[decided]))
-
-        every = np.ones_like(held)
-        chosen = every, held, held & stable, sample
-        for column, own in zip(funnel.preshapes.T, chosen, strict=True):
-            _count(column, preshape[own])
+        _count_block(funnel, block)
 
     # From where the palms of the samples approach.
     samples = _samples(trials)
@@ -275,6 +244,44 @@ def funnel_of(trials: Trials) -> Funnel:
     own = samples.distinct
     _count(funnel.elevations, (samples.objects[own], bands[own]))
     return funnel
+
+
+def _empty_funnel(names: Sequence[str], classes: Sequence[str]) -> Funnel:
+    """Return the funnel of objects without attempts."""
+    count = len(names)
+
+    def zeros(*shape: int) -> npt.NDArray[np.int64]:
+        return np.zeros(shape, dtype=np.int64)
+
+    return Funnel(
+        names=tuple(names),
+        classes=tuple(classes),
+        candidates=zeros(count),
+        outcomes=zeros(count, 1 + max(Outcome)),
+        precision=zeros(count),
+        stable=zeros(count),
+        removals=zeros(count, 1 + max(Removal)),
+        elevations=zeros(count, len(BANDS)),
+        approach_cells=zeros(count),
+        preshapes=zeros(1 + NO_PRESHAPE, 4),
+    )
+
+
+def _count_block(funnel: Funnel, block: Mapping[str, AnyArray]) -> None:
+    """Add attempts to a funnel, given their columns _COUNTED."""
+    number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
+    held, stable, preshape = outcome == Outcome.SUCCESS, block["stable"], block["preshape"]
+
+    # Palm poses, outcomes, labels of the hold, removals, and preshapes.
+    _count(funnel.candidates, number[block["standoff_index"] == 0])
+    _count(funnel.outcomes, (number, outcome))
+    _count(funnel.precision, number[block["precision"]])
+    _count(funnel.stable, number[stable])
+    decided = removal != NONE
+    _count(funnel.removals, (number[decided], removal[decided]))
+    chosen = np.ones_like(held), held, held & stable, removal == Removal.KEPT
+    for column, own in zip(funnel.preshapes.T, chosen, strict=True):
+        _count(column, preshape[own])
 
 
 class _Samples(NamedTuple):

@@ -12,7 +12,6 @@ import operator
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -21,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_names, read_rows, read_texts, sizes_in
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, read_names, read_texts
 from drakegrasp.dataset.opening import (
     open_samples,
     open_trials,
@@ -31,7 +30,6 @@ from drakegrasp.dataset.opening import (
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard, trial_columns
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT, Frame, invert_pose, unpack_pose
@@ -57,23 +55,6 @@ FIELDS = {f.name: f for f in TRIAL_FIELDS}
 Stamp = tuple[int, ...] | None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrialPart:
-    """The rows of one file: trials.hdf5, or during a build the shard of one work unit.
-
-    Attributes:
-        path: Path of the file.
-        count: Number of rows.
-        header: Identity of the shard; None for trials.hdf5.
-        object: Row of the shard's object among the objects.
-    """
-
-    path: Path
-    count: int
-    header: ShardHeader | None = None
-    object: int = 0
-
-
 class Trials:
     """Attempts of a dataset as columns and rows; a selection of them is again a `Trials`.
 
@@ -88,8 +69,7 @@ class Trials:
     Attributes:
         path: The directory of the dataset, or its trials.hdf5, as an absolute path.
         objects: Columns of `/objects` by the names of the schema; texts are str.
-        attributes: Attributes of trials.hdf5, e.g. `config` as JSON; empty if there is no such
-            file.
+        attributes: Attributes of trials.hdf5, e.g. `config` as JSON.
 
     Raises:
         DataError: If the file is missing, damaged or differs from the schema.
@@ -108,32 +88,12 @@ class Trials:
                 else group[f.name][:]
                 for f in OBJECT_FIELDS
             }
-            self._parts: tuple[TrialPart, ...] = (
-                TrialPart(path=path, count=len(file["trials/outcome"])),
-            )
+            self._count = len(file["trials/outcome"])
             self.attributes: Mapping[str, Any] = dict(file.attrs)
-        self._stamp = stamp(path)
-        self._count = self._parts[0].count
+        self._file, self._stamp = path, stamp(path)
         # The selected rows (None: all), and what `_of_all` has read, which all selections share.
         self._rows: npt.NDArray[np.int64] | None = None
         self._known: dict[str, npt.NDArray[np.uint8]] = {}
-
-    @classmethod
-    def of_parts(
-        cls, out: Path, objects: Mapping[str, AnyArray], parts: Sequence[TrialPart]
-    ) -> Trials:
-        """Return the attempts in some shards of a build that is not assembled yet.
-
-        Args:
-            out: Directory of the dataset.
-            objects: Columns of its objects, at least `name` and `class_name`.
-            parts: Files of the attempts, in the order of the rows.
-        """
-        trials = cls.__new__(cls)
-        trials.path, trials.objects, trials.attributes = out, objects, {}
-        trials._parts, trials._stamp, trials._rows = tuple(parts), None, None
-        trials._count, trials._known = sum(part.count for part in parts), {}
-        return trials
 
     def _chosen(self, rows: npt.NDArray[np.int64]) -> Trials:
         """Return the attempts at given rows of all attempts."""
@@ -190,8 +150,8 @@ class Trials:
             DataError: If there is no such row.
         """
         if not 0 <= trial_id < self._count:
-            file, last = self._parts[0].path, self._count - 1
-            raise DataError(f"{file}: trial must be 0 to {last}, got {trial_id}")
+            last = self._count - 1
+            raise DataError(f"{self._file}: trial must be 0 to {last}, got {trial_id}")
         return self._chosen(np.array([trial_id]))[0]
 
     def where(
@@ -233,8 +193,8 @@ class Trials:
 
         Args:
             names: Fields of `/trials`, or DERIVED ones; if None, all except `split`, which is read
-                from the data files. A field that an older file lacks, or whose stage an attempt did
-                not reach, is NaN, 0 or False.
+                from the data files. A field that the file lacks, or whose stage an attempt did not
+                reach, is NaN, 0 or False.
 
         Raises:
             DataError: If there is no such column, or a file was replaced.
@@ -268,17 +228,11 @@ class Trials:
             if name not in FIELDS and name not in DERIVED:
                 known = ", ".join([*FIELDS, *DERIVED])
                 raise DataError(f"column must be one of {known}, got {name!r}")
-        empty = True
-        for part, start in self._starts():
-            own = np.arange(part.count)
-            if self._rows is not None:
-                first, last = np.searchsorted(self._rows, [start, start + part.count])
-                own = self._rows[first:last] - start
-            if len(own):
-                empty = False
-                yield from self._read(part, start, own, names)
-        if empty:
-            yield self._nothing(names)
+        rows = self.trial_ids
+        with reopened(self._file, self._stamp, "the trials of a dataset") as file:
+            # The first block may be empty.
+            for block in np.split(rows, np.flatnonzero(np.diff(rows // BLOCK)) + 1):
+                yield self._read(file, block, names)
 
     def contacts(
         self, when: Literal["closed", "lifted"] = "closed", *, frame: str = Frame.OBJECT
@@ -368,77 +322,40 @@ class Trials:
 
     # Files
 
-    def _starts(self) -> Iterator[tuple[TrialPart, int]]:
-        """Yield each part with the number of rows before it."""
-        start = 0
-        for part in self._parts:
-            yield part, start
-            start += part.count
-
-    @contextmanager
-    def _open(self, part: TrialPart) -> Iterator[h5py.File]:
-        """Open a part, which must be the file that was first read."""
-        if part.header is not None:
-            with open_shard(part.path, part.header, verify_seal=False, again=True) as (file, _):
-                yield file
-            return
-        with reopened(part.path, self._stamp, "the trials of a dataset") as file:
-            yield file
-
     def _read(
-        self, part: TrialPart, start: int, rows: npt.NDArray[np.int64], names: Sequence[str]
-    ) -> Iterator[dict[str, AnyArray]]:
-        """Yield columns of some rows of a part, whose first row is row `start` of all attempts."""
-        with self._open(part) as file:
-            for block in np.split(rows, np.flatnonzero(np.diff(rows // BLOCK)) + 1):
-                yield {name: self._column(name, file, part, start, block) for name in names}
-
-    def _column(
-        self, name: str, file: h5py.File, part: TrialPart, start: int, rows: npt.NDArray[np.int64]
-    ) -> AnyArray:
-        """Return a column for rows of a part that are close together."""
-        if name not in (*DERIVED, *ASSEMBLED_FIELDS):
-            codes = list(Outcome) if name == "outcome" else None
-            return _stored(name, file["trials"], rows, codes)
-        # Columns that are known for the whole dataset only.
-        if name == "trial_id":
-            return start + rows
-        if name in ("removal", "split"):
-            return self._of_all(name)[start + rows]
-        if part.header is not None:
-            number = np.full(len(rows), part.object, dtype=np.int32)
-        else:
-            number = _stored("object", file["trials"], rows, len(self.objects["name"]))
-        return number if name == "object" else self.objects[name.removeprefix("object_")][number]
+        self, file: h5py.File, rows: npt.NDArray[np.int64], names: Sequence[str]
+    ) -> dict[str, AnyArray]:
+        """Return columns of rows that are close together."""
+        near = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
+        stored = {name for name in names if name in FIELDS}
+        stored |= {"object"} if {"object_name", "class_name"} & {*names} else set()
+        table = read_columns(file["trials"], TRIAL_FIELDS, stored, near)
+        for name, codes in (("outcome", list(Outcome)), ("object", len(self.objects["name"]))):
+            if name in stored:
+                place = f"/trials/{name}"
+                refuse_other_codes(self._file, place, table[name], codes, near.start)
+        columns = dict(table[rows - near.start])
+        for name in ("removal", "split"):
+            if name in names:
+                columns[name] = self._of_all(name)[rows]
+        for name in ("object_name", "class_name"):
+            if name in names:
+                columns[name] = self.objects[name.removeprefix("object_")][columns["object"]]
+        return {name: columns[name] for name in names}
 
     def _of_all(self, name: str) -> npt.NDArray[np.uint8]:
         """Return `removal` or `split` of all attempts; NONE for attempts without a decision."""
         if name not in self._known:
             values = np.full(self._count, NONE, dtype=np.uint8)
-            assembled = [part for part in self._parts if part.header is None]
-            for part in assembled if name == "removal" else ():
-                with self._open(part) as file:
+            if name == "removal":
+                with reopened(self._file, self._stamp, "the trials of a dataset") as file:
                     success = read_codes(file["successes/trial_id"], self._count)
                     values[success] = read_codes(file["successes/removal"], list(Removal))
-            if name == "split" and len(assembled) == len(self._parts):
+            else:
                 for number, ids in enumerate(sample_ids(self.path).values()):
                     values[ids[ids < len(values)]] = number
             self._known[name] = values
         return self._known[name]
-
-    def _nothing(self, names: Sequence[str]) -> dict[str, AnyArray]:
-        """Return columns without any attempts."""
-        sizes = {"k": 0, "j": 0}
-        if self._parts:
-            with self._open(self._parts[0]) as file:
-                sizes = sizes_in(file["trials"], FIELDS.values())
-        derived = {"removal": np.uint8, "split": np.uint8}
-        return {
-            name: FIELDS[name].empty(0, sizes)
-            if name in FIELDS
-            else np.zeros(0, dtype=derived.get(name, object))
-            for name in names
-        }
 
 
 def _outcome(outcome: Outcome | str) -> Outcome:
@@ -446,50 +363,6 @@ def _outcome(outcome: Outcome | str) -> Outcome:
     if isinstance(outcome, str) and outcome not in labels:
         raise DataError(f"outcome must be one of {', '.join(labels)}, got {outcome!r}")
     return labels[outcome] if isinstance(outcome, str) else outcome
-
-
-def _stored(
-    name: str,
-    trials: h5py.Group,
-    rows: npt.NDArray[np.int64],
-    codes: int | list[Outcome] | None = None,
-) -> AnyArray:
-    """Return a stored column for rows that are close together.
-
-    Args:
-        name: Name of the column.
-        trials: Group of the file that contains the column.
-        rows: Rows in rising order.
-        codes: Valid codes of the column, see `refuse_other_codes`; None for measured values.
-    """
-    near = slice(int(rows[0]), int(rows[-1]) + 1)
-    values = read_rows(trials, FIELDS[name], near, FIELDS.values())
-    if codes is not None:
-        path = Path(trials.file.filename)
-        refuse_other_codes(path, f"/trials/{name}", values, codes, near.start)
-    return values[rows - near.start]
-
-
-def shard_part(
-    out: Path, header: ShardHeader, object_: int, names: Sequence[str] | None = None
-) -> TrialPart:
-    """Return the attempts in a shard; its seal is not verified, since this reads the whole file.
-
-    Args:
-        out: Directory of the dataset.
-        header: Header of the shard.
-        object_: Row of its object among the objects.
-        names: Columns that must exist; if None, all columns and images of a shard must.
-
-    Raises:
-        DataError: If the file is missing, damaged, or another shard.
-    """
-    path = header.path(out)
-    stored = tuple(f for f in trial_columns() if f.name in (*(names or ()), "outcome"))
-    tables = None if names is None else {"trials": stored}
-    with open_shard(path, header, tables, verify_seal=False) as (file, _):
-        count = len(file["trials/outcome"])
-    return TrialPart(path=path, count=count, header=header, object=object_)
 
 
 def sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:

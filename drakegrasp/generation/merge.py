@@ -17,7 +17,8 @@ from typing import TypeAlias
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
-from drakegrasp.dataset.assembly.survey import headers_by_object, own_filters
+from drakegrasp.dataset.assembly.removal import own_filters
+from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -34,7 +35,6 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError
 from drakegrasp.hand.folder import carry_hand
-from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.runtime.progress import Report, silent
 
@@ -54,7 +54,6 @@ def merge(
     outs: Sequence[Path],
     *,
     overrides: Sequence[str] = (),
-    execute: Executor = run_here,
     progress: Report = silent,
 ) -> Assembly:
     """Merge several datasets into a new one, which appears when it is complete.
@@ -67,8 +66,7 @@ def merge(
         outs: Directories of the datasets; the objects are merged in this order.
         overrides: Overrides as for `assemble`, applied to all datasets, which may differ in the
             keys that these set.
-        execute: Runs the tasks of assembling.
-        progress: Called with the number of completed tasks and of all tasks.
+        progress: As for `assemble`.
 
     Raises:
         ConfigError: If an override or a user-defined filter cannot be used.
@@ -80,7 +78,7 @@ def merge(
     # Reject invalid input before anything is written.
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise DataError(f"{into}: must be a new or empty directory, got one that is in use")
-    manifests = {out: with_postprocessing(_read_complete(out, execute), overrides) for out in outs}
+    manifests = {out: with_postprocessing(_read_complete(out), overrides) for out in outs}
     incomplete = [out for out in outs if _is_part(out)]
     _refuse_differences(manifests)
     parts = _parts(manifests)
@@ -94,13 +92,13 @@ def merge(
         manifest = _with_hand(manifest, manifests.values(), folder)
         write_manifest(manifest, folder)
         _refuse_missing(manifest, folder, incomplete)
-        return assemble_locked(folder, manifest, execute=execute, progress=progress)
+        return assemble_locked(folder, manifest, progress=progress)
 
 
-def _read_complete(out: Path, execute: Executor) -> Manifest:
+def _read_complete(out: Path) -> Manifest:
     """Return the manifest of a complete dataset, or of a part of a dataset."""
     manifest = read_manifest(out)
-    if not _is_part(out) and not is_assembled(out, verify_shards=True, execute=execute):
+    if not _is_part(out) and not is_assembled(out, verify_shards=True):
         raise DataError(
             f"{out}: must be a complete dataset, got one whose files are not of all its shards; "
             "complete it with `drakegrasp build` or `assemble`"

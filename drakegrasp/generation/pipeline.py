@@ -20,15 +20,8 @@ import numpy as np
 
 from drakegrasp.config import MOST_PALMS, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
-from drakegrasp.dataset.assembly.survey import (
-    headers_by_object,
-    judge_successes,
-    known_homes,
-    number_rows,
-    own_filters,
-    survey_object,
-    survey_tasks,
-)
+from drakegrasp.dataset.assembly.removal import judge_successes, own_filters
+from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, known_homes, survey
 from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.lock import BuildLog, build_lock
 from drakegrasp.dataset.manifest import (
@@ -79,7 +72,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.objects.sources import MeshSource, source_sha256
-from drakegrasp.runtime.executor import Executor, WorkerPool, in_order
+from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import Attempts, misfits
@@ -312,6 +305,7 @@ class _Build:
         self._postures, self._show, self.log = postures, show, BuildLog(out)
         self._floors: dict[str, int] = {}
         self._warnings: list[str] = []
+        self._surveyed: Survey | None = None  # of the last check for outliers
 
     def run(
         self,
@@ -391,10 +385,10 @@ class _Build:
             Whether the files were written.
         """
         out, execute = self._out, self._execute
-        stale = not is_assembled(out, verify_shards=True, execute=execute)
+        stale = not is_assembled(out, verify_shards=True)
         if stale:
-            with self._progress("assemble", "tasks") as report:
-                assemble_locked(out, manifest, execute=execute, progress=report)
+            with self._progress("assemble", "shards") as report:
+                assemble_locked(out, manifest, surveyed=self._surveyed, progress=report)
         else:
             write_card(out)  # the licence of a mesh may have changed
         scenes = manifest.config.scenes.when == "assembled"
@@ -541,7 +535,7 @@ class _Build:
             counts.add(summary, reused=reused)
 
         done = set[ShardHeader]()
-        find = partial(find_units, config)
+        find = partial(find_units, self._out, config)
         for units, damaged in self._execute(find, find_tasks(self._out, manifest)):
             for summary in units:
                 done.add(summary.header)
@@ -601,11 +595,10 @@ class _Build:
         config, names = manifest.config, [entry.name for entry in manifest.objects]
         if config.filters.outlier_sigma == 0.0 or config.max_grasps is not None:
             return {}
-        tasks = survey_tasks(self._out, manifest)
-        surveys = list(in_order(self._execute)(survey_object, tasks))
-        if not surveys:
+        if not manifest.units:
             return {}
-        successes = number_rows(surveys, manifest).successes
+        self._surveyed = survey(self._out, manifest)
+        successes = self._surveyed.successes
         lost = judge_successes(successes, config.filters) == Removal.OUTLIER
         counts = np.bincount(successes["object"][lost], minlength=len(names))
         return dict(zip(names, counts.tolist(), strict=True))

@@ -18,15 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.survey import (
-    SurveyTask,
-    find_hits,
-    survey_tasks,
-)
+from drakegrasp.dataset.assembly.removal import find_hits
+from drakegrasp.dataset.assembly.successes import successes_of
+from drakegrasp.dataset.assembly.survey import headers_by_object, shard_successes
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import object_files, places, shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, ROBUST_FIELDS
-from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
+from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, write_shard
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import (
@@ -149,7 +147,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
     with _one_unit, disk_full_named(out):
         try:
             # A process may have died after writing the shard and before returning.
-            summary = _find_unit(out, header)
+            summary = _find_unit(out, header, unit.config)
         except DataError:
             summary = None
         if summary is None and unit.restartable:
@@ -159,7 +157,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
             summary = _Experiment(unit, NO_JOURNAL).run()
         header.journal_path(out).unlink(missing_ok=True)
         trim_memory()
-        return _with_hits(out, summary, unit.config)
+        return summary
 
 
 class _Experiment:
@@ -205,7 +203,13 @@ class _Experiment:
             outcomes=count_outcomes(trials["outcome"]),
             seconds=self._seconds,
             errors=dict(self._errors),
+            hits=self._hits(trials, looks) if self._config.has_target else (),
         )
+
+    def _hits(self, trials: dict[str, AnyArray], looks: Table) -> tuple[tuple[int, int], ...]:
+        """Return the attempts that count for the target."""
+        rows = Table(trials)[looks["row"]]
+        return _hits(rows.with_columns(looks, depth_otm=looks["image_otm"][:, 3]), self._config)
 
     @contextmanager
     def _step(self, step: str) -> Iterator[None]:
@@ -323,8 +327,8 @@ def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
 # Units that are done
 
 
-def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
-    """Return the summary of a completed unit without its hits, or None if it has no shard.
+def _find_unit(out: Path, header: ShardHeader, config: Config) -> UnitSummary | None:
+    """Return the summary of a completed unit, or None if it has no shard.
 
     Raises:
         DataError: If the shard is damaged or belongs to another unit.
@@ -332,29 +336,31 @@ def _find_unit(out: Path, header: ShardHeader) -> UnitSummary | None:
     path = header.path(out)
     if not path.exists():
         return None
-    outcomes = count_outcomes(read_trials(path, header, ("outcome",))["outcome"])
-    return UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={})
+    with open_shard(path, header) as (file, _):
+        outcomes = count_outcomes(file["trials/outcome"][:])
+        hits = _hits(shard_successes(file), config) if config.has_target else ()
+    return UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, hits=hits)
 
 
-def _with_hits(out: Path, summary: UnitSummary, config: Config) -> UnitSummary:
-    """Return a summary with its hits, if there is a target."""
-    if not config.has_target:
-        return summary
-    return replace(summary, hits=tuple(find_hits(out, summary.header, config)))
+def _hits(rows: Table, config: Config) -> tuple[tuple[int, int], ...]:
+    """Return the hits among the successes of a unit, given their rows as `successes_of` does."""
+    return find_hits(successes_of(rows, config.camera), config)
 
 
-def find_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
-    """Yield the task of each object that may have a shard, for `find_units`."""
+def find_tasks(out: Path, manifest: Manifest) -> Iterator[tuple[ShardHeader, ...]]:
+    """Yield the work units of each object that may have a shard, for `find_units`."""
     try:
         folders = set(os.listdir(out / "shards"))
     except FileNotFoundError:
         return
-    for task in survey_tasks(out, manifest):
-        if shards_folder(out, task.headers[0].object_name).name in folders:
-            yield task
+    for headers in filter(None, headers_by_object(manifest)):
+        if shards_folder(out, headers[0].object_name).name in folders:
+            yield headers
 
 
-def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
+def find_units(
+    out: Path, config: Config, headers: Sequence[ShardHeader]
+) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
     """Find an object's completed units in a dataset.
 
     The folder is listed once, and the seals of its shards are verified. A build that continues runs
@@ -364,12 +370,12 @@ def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], lis
         The summaries of the work units with a valid shard, and for each damaged shard its path
         within the dataset and what is wrong with it.
     """
-    out, done, damaged = Path(task.out), list[UnitSummary](), list[tuple[str, str]]()
-    names = set(os.listdir(shards_folder(out, task.headers[0].object_name)))
-    for header in task.headers:
+    done, damaged = list[UnitSummary](), list[tuple[str, str]]()
+    names = set(os.listdir(shards_folder(out, headers[0].object_name)))
+    for header in headers:
         # Open only files that are listed.
         try:
-            found = _find_unit(out, header) if header.file_name in names else None
+            found = _find_unit(out, header, config) if header.file_name in names else None
         except DataError as error:
             damaged.append((str(header.path(out).relative_to(out)), str(error)))
             found = None
@@ -379,5 +385,5 @@ def find_units(config: Config, task: SurveyTask) -> tuple[list[UnitSummary], lis
         # A process may have died after writing the shard and before removing the journal.
         if header.journal_path(out).name in names:
             header.journal_path(out).unlink(missing_ok=True)
-        done.append(_with_hits(out, found, config))
+        done.append(found)
     return done, damaged

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.assembly.survey import own_setting
+from drakegrasp.dataset.assembly.removal import own_setting
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.quality import PARTS, suspicion
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions

@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import differences, read_manifest, same_results
+from drakegrasp.dataset.manifest import differences, read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, MeshError, listed
@@ -168,6 +168,6 @@ def read_benchmark(out: Path, config: Config, versions: Mapping[str, str]) -> di
         "other_versions": {
             name: f"{versions.get(name)}, published with {version}"
             for name, version in stated.items()
-            if not same_results(name, version, versions.get(name, ""))
+            if version != versions.get(name, "")
         },
     }

@@ -144,8 +144,6 @@ def test_damaged_image_names_the_file(out: Path) -> None:
     data = GraspDataset(out / OTO, split=split)
     with pytest.raises(DataError, match=f"{OTO}: must be undamaged, got: "):
         data[0]
-    with pytest.raises(DataError, match=f"{OTO}: must be undamaged, got: "):
-        data.read_images("images", [0], np.empty((1, 4, *[data.image_size] * 2), np.float32))
 
 
 def test_script_that_a_worker_imports_again_starts_nothing(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,11 @@ import pytest
 from helpers.assertions import arrays_of
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
+from drakegrasp.dataset import assemble as module
 from drakegrasp.dataset import hdf5, shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
-from drakegrasp.dataset.assembly import pack, survey
+from drakegrasp.dataset.assembly import survey
+from drakegrasp.dataset.assembly.successes import in_image
 from drakegrasp.dataset.lock import LOCK_FILE, build_lock
 from drakegrasp.dataset.manifest import read_manifest, with_postprocessing
 from drakegrasp.dataset.schema import CAMERAS
@@ -31,8 +33,7 @@ from drakegrasp.frames import (
     transform_points,
     unpack_pose,
 )
-from drakegrasp.grasp import pack_grasp, unpack_grasp
-from drakegrasp.runtime.executor import processes
+from drakegrasp.grasp import unpack_grasp
 from drakegrasp.runtime.files import refuse_broken_seal, seal
 
 FILES = (OTO, OTM, TRIALS)
@@ -186,8 +187,7 @@ def test_a_success_that_is_spoiled_is_removed_for_that_reason(out: Path, first: 
 def removed(sound: Path) -> Callable[..., Counter[Removal]]:
     """Returns how many successes assembling with other filters removes, by the reason."""
     manifest = read_manifest(sound)
-    tasks = survey.survey_tasks(sound, manifest)
-    surveyed = survey.number_rows(list(map(survey.survey_object, tasks)), manifest)
+    surveyed = survey.survey(sound, manifest)
 
     def count(*overrides: str) -> Counter[Removal]:
         decisions = survey.decide(with_postprocessing(manifest, overrides), surveyed)
@@ -237,16 +237,11 @@ def test_camera_height_is_above_the_table(
         ([0.0, 0.0, -0.3], False),
     ],
 )
-def test_contact_is_in_view_within_the_image_and_before_the_camera(
-    p_CQ: list[float], seen: bool
-) -> None:
-    """A camera of 33 pixels that sees 45 degrees to each side; one finger is left out."""
+def test_contact_is_in_view_within_the_image_and_before_the_camera(p_CQ: Any, seen: bool) -> None:
+    """A camera of 33 pixels that sees 45 degrees to each side."""
     K = np.array([[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]])
-    X_TC = make_pose(rotation_about([1.0, 0.0, 0.0], 2.0), [0.1, 0.2, 0.7])
-    p_TQ = transform_points(X_TC, np.array([[0.0, 0.0, 0.4], p_CQ, [np.nan] * 3]))
-    grasp_T = pack_grasp(p_TQ, np.tile([0.0, 0.0, 1.0], (3, 1)))
-    unused = np.array([False, False, True])
-    assert survey._in_view(K, 33, pack_pose(X_TC), grasp_T, unused) is seen
+    p_CQ = np.array([[0.0, 0.0, 0.4], p_CQ, [np.nan] * 3])
+    assert in_image(K, 33, p_CQ).tolist() == [True, seen, False]
 
 
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
@@ -382,63 +377,19 @@ def test_whenever_assembling_is_killed_the_files_are_of_one_state(out: Path) -> 
     assert [(out / name).read_bytes() for name in FILES] == before
 
 
-def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-    """Run the last task first."""
-    return iter([function(item) for item in reversed(list(items))])
-
-
-@pytest.fixture
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks of five rows, in tasks of ten: a task begins and ends within a shard."""
-    monkeypatch.setattr(hdf5, "COLUMN_CHUNK", 5)
-    monkeypatch.setattr(pack, "TASK_ROWS", 10)
-
-
-@pytest.mark.usefixtures("small_chunks")
-def test_files_do_not_depend_on_the_order_of_the_tasks(out: Path) -> None:
+def test_rows_of_many_chunks_are_those_of_one(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks of five rows, in blocks of ten: a block begins and ends within a shard."""
     before = {name: arrays_of(out / name) for name in FILES}
-    assemble(out)
-    in_order = [(out / name).read_bytes() for name in FILES]
+    monkeypatch.setattr(hdf5, "COLUMN_CHUNK", 5)
+    monkeypatch.setattr(module, "BLOCK", 10)
+    seen: list[tuple[int, int | None]] = []
+    assemble(out, progress=lambda done, total, **_: seen.append((done, total)))
+    assert seen == sorted(seen)
+    assert seen[-1] == (12, 12)
     with h5py.File(out / TRIALS) as file:
         assert file["trials/X_TO"].chunks == (5, 12)
         assert len(file["trials/X_TO"]) == 36
-    assemble(out, execute=backwards)
-    assert [(out / name).read_bytes() for name in FILES] == in_order
     np.testing.assert_equal({name: arrays_of(out / name) for name in FILES}, before)
-
-
-@pytest.mark.nightly
-def test_files_do_not_depend_on_the_number_of_processes(out: Path) -> None:
-    before = [(out / name).read_bytes() for name in FILES]
-    with processes(2) as execute:
-        assemble(out, execute=execute)
-    assert [(out / name).read_bytes() for name in FILES] == before
-
-
-@pytest.mark.usefixtures("small_chunks")
-def test_what_a_task_left_is_removed_when_another_fails(out: Path) -> None:
-    def last_fails(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-        done = [function(item) for item in items]
-        yield from reversed(done[1:])
-        if len(done) > 3:
-            assert list(out.glob(".rows-*"))
-            raise DataError("lost")
-        yield done[0]
-
-    before = [(out / name).read_bytes() for name in FILES]
-    with pytest.raises(DataError, match="lost"):
-        assemble(out, execute=last_fails)
-    assert [(out / name).read_bytes() for name in FILES] == before
-    assert not list(out.glob(".*"))
-
-
-def test_a_pool_of_processes_says_what_a_task_raised(out: Path) -> None:
-    sorted(out.glob("shards/*/*.h5"))[0].unlink()
-    with (
-        processes(2) as execute,
-        pytest.raises(DataError, match="must be a complete shard, got none"),
-    ):
-        assemble(out, execute=execute)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

@@ -74,17 +74,6 @@ def test_card_says_that_held_grasps_are_a_lower_bound(out: Path) -> None:
     assert limit["docs"] == "docs/reference/outcomes.md"
 
 
-def test_card_compares_forces_with_the_rated_load(out: Path) -> None:
-    """12.5 N after the lift; then one that presses with 20 N in the direction of no axis."""
-    loads = card_content(out)["fingertip_loads"]
-    assert loads == {"rated_N": pytest.approx(19.62), "above": 0, "samples": 9, "median_N": 12.5}
-    with h5py.File(out / "grasping_oto.hdf5", "r+") as file:
-        file["train/grasp_props/f_Q_C"][0, 1] = [12.0, 16.0, 0.0]
-    content = card_content(out)
-    assert content["fingertip_loads"]["above"] == 1
-    assert "In 1 of 9 samples one presses\nharder" in card_text(content)
-
-
 def test_limits_name_pages_that_exist(out: Path) -> None:
     root = Path(__file__).resolve().parents[2]
     for each in card_content(out)["limits"]:

@@ -251,20 +251,6 @@ def test_a_file_with_other_samples_is_refused(tmp_path: Path) -> None:
         data.column("grasps")
 
 
-def test_columns_in_each_others_place_are_refused(tmp_path: Path) -> None:
-    """Of one type and shape: only what each says of itself tells them apart."""
-    path = write_data_file(tmp_path / "swapped.hdf5", range(5))
-    with h5py.File(path, "r+") as file:
-        frames = file["train/object_props"]
-        names = "frame_work2cam_oto", "frame_work2cam_otm"
-        frames.move(names[0], "kept")
-        frames.move(names[1], names[0])
-        frames.move("kept", names[1])
-    message = "must be object_props/frame_work2cam_ot., got object_props/frame_work2cam_ot."
-    with pytest.raises(DataError, match=message):
-        GraspDataset(path, split="train")
-
-
 def test_images_inflated_here_are_those_of_hdf5(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

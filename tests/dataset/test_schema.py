@@ -16,7 +16,6 @@ from helpers.datasets import OTM, OTO, TRIALS, edit_file, edit_manifest, make_da
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import claim_directory
-from drakegrasp.dataset.opening import DATA_TABLES, SCENE_TABLES, TRIAL_TABLES, Tables
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
@@ -40,13 +39,6 @@ from drakegrasp.table import Table
 from drakegrasp.verification.result import Verification
 
 SIZES = sizes(fingers=3, joints=4, image=8)
-
-
-@pytest.mark.parametrize("tables", [DATA_TABLES, TRIAL_TABLES, SCENE_TABLES])
-def test_fields_of_a_group_have_meanings_of_their_own(tables: Tables) -> None:
-    """By its meaning a column says which it is."""
-    for fields in tables.values():
-        assert len({field.meaning for field in fields}) == len(fields)
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,8 @@ from helpers.datasets import OTO, SUCCESS, TRIALS, edit_file
 
 from drakegrasp.dataset import trials as trials_module
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.trials import NONE, Trials, shard_part
+from drakegrasp.dataset.trials import NONE, Trials
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import X_WT, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -228,17 +227,6 @@ def test_trials_may_be_sent_to_another_process(sound: Path) -> None:
     again = pickle.loads(pickle.dumps(held))
     assert again.trial_ids.tolist() == held.trial_ids.tolist()
     assert again[0]["trial_id"] == SUCCESS
-
-
-def test_attempts_in_shards_are_those_of_the_file(sound: Path) -> None:
-    manifest, whole = read_manifest(sound), Trials(sound)
-    names = [entry.name for entry in manifest.objects]
-    parts = [shard_part(sound, h, names.index(h.object_name)) for h in manifest.headers()]
-    building = Trials.of_parts(sound, whole.objects, parts)
-    for name in (*(field.name for field in TRIAL_FIELDS), "object_name", "class_name"):
-        np.testing.assert_array_equal(building[name], whole[name])
-    assert (building["removal"] == NONE).all()
-    assert (building["split"] == NONE).all()
 
 
 def test_the_working_directory_may_change(

@@ -20,7 +20,7 @@ from starlette.testclient import TestClient
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.assembly.survey import judge_successes
+from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
