@@ -26,6 +26,7 @@ import yaml
 
 from drakegrasp.config import CarriedHand, Config, HandSource
 from drakegrasp.errors import DataError, HandError
+from drakegrasp.hand.file_format import hand_keys
 from drakegrasp.hand.files import (
     MODEL_SUFFIXES,
     MODELS,
@@ -38,7 +39,7 @@ from drakegrasp.hand.files import (
     rewritten,
 )
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
-from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
+from drakegrasp.yaml_text import parse_yaml
 
 #: Maximum total size [byte], YAML size [byte] and number of a hand's files; a stranger may have
 #: written them.
@@ -271,8 +272,8 @@ def _mentions(path: Path) -> list[str]:
 def _described(path: Path) -> Mapping[str, Any]:
     """Return the keys of a hand file; empty if the file is not a YAML mapping."""
     try:
-        tree = parse_yaml_once(path.read_bytes())
-    except (yaml.YAMLError, UnicodeDecodeError):
+        tree = hand_keys(path)
+    except HandError:
         return {}
     return tree if isinstance(tree, dict) else {}
 
