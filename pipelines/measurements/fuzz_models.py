@@ -32,11 +32,10 @@ import trimesh
 from fuzz_files import change_tree, flip, judge, other_kind, preload, read, say_findings, truncate
 
 from drakegrasp.cli.main import main as command
-from drakegrasp.commissioning.checks import check_geometry, check_limits
-from drakegrasp.commissioning.draft.model import read_model
-from drakegrasp.commissioning.draft.run import write_urdf
-from drakegrasp.commissioning.draft.source import read_source
+from drakegrasp.hand.checks import check_geometry, check_limits
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.draft.source import read_model
+from drakegrasp.hand.draft.urdf import write_urdf
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.loading import load_mesh
@@ -350,7 +349,7 @@ def check(folder: Path) -> None:
     """Load and check a hand without trial grasps; if there is no hand file, read the model."""
     if not (folder / "hand.yaml").exists() and not (folder / "hand.yaml").is_symlink():
         (path,) = (p for p in folder.iterdir() if p.suffix in (".urdf", ".sdf", ".xml"))
-        model = read_model(read_source(path, {}, ()))
+        model = read_model(path)
         with tempfile.TemporaryDirectory() as out:
             write_urdf(model, Path(out) / "hand.urdf", ())
         return

@@ -15,7 +15,7 @@ the object at the start, and contacts follow Drake's model: a pair has no coeffi
 because torsion follows from the patch.
 
     python pipelines/measurements/shadow_in_drake.py HAND.xml GRASPS --assets DIR --out LINES.jsonl
-        [--root DIR] [--mujoco VERDICTS.jsonl]
+        [--mujoco VERDICTS.jsonl]
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import trimesh
 import yaml
 from pydrake.multibody.tree import PdControllerGains
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.commissioning.draft.model import read_model
-from drakegrasp.commissioning.draft.run import write_urdf
-from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.config import Config
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.draft.source import read_model
+from drakegrasp.hand.draft.urdf import write_urdf
 from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import prepare_object
@@ -77,9 +77,6 @@ def main() -> None:
         "--assets", type=Path, required=True, help="folder at which obj_path begins"
     )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument(
-        "--root", type=Path, action="append", default=[], help="folder of the meshes"
-    )
     parser.add_argument("--mujoco", type=Path, help="verdicts of verify --protocol")
     given = parser.parse_args()
 
@@ -88,7 +85,7 @@ def main() -> None:
     known = given.out.read_text(encoding="utf-8").splitlines() if given.out.exists() else []
     done = {json.loads(line)["file"]: json.loads(line) for line in known}
     with tempfile.TemporaryDirectory() as scratch, given.out.open("a", encoding="utf-8") as lines:
-        hand, joints = make_hand(given.hand, given.root, Path(scratch))
+        hand, joints = make_hand(given.hand, Path(scratch))
         bench = Bench(
             hand=hand, joints=joints, assets=given.assets, scratch=Path(scratch), config=config
         )
@@ -117,12 +114,10 @@ def _replace_rules() -> None:
     motors._add_motor = add_tendon
 
 
-def make_hand(path: Path, roots: list[Path], folder: Path) -> tuple[Hand, list[str]]:
+def make_hand(path: Path, folder: Path) -> tuple[Hand, list[str]]:
     """Return the benchmark's hand and its joints in order; all links of a finger may touch."""
-    source = read_source(path, {}, roots)
-    write_urdf(read_model(source), folder / "shadow.urdf", [])
-    (world,) = source.root.iter("worldbody")
-    joints = [joint.get("name", "") for joint in world.iter("joint")]
+    write_urdf(read_model(path), folder / "shadow.urdf", [])
+    joints = [joint.name for joint in mujoco.MjSpec.from_file(str(path)).joints]
     fingers = []
     for name, joint in FINGERS.items():
         behind = [f"rh_{joint[:-1]}{n}" for n in range(1, int(joint[-1]))]

@@ -1,17 +1,17 @@
 """MJCF as MuJoCo compiles it.
 
-Input: the XML of an MJCF file, and its meshes. Output: bodies with their shapes and inertias,
-joints, couplings and efforts, all of them from the compiled model.
+Input: an MJCF file. Output: bodies with their shapes and inertias, joints, couplings and efforts,
+all of them from the compiled model. MuJoCo gets the triangles of mesh files as `mesh.loading` reads
+them.
 """
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
@@ -20,30 +20,31 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.commissioning.draft.parts import ENDLESS, Carrier, Link, Parts, motion
-from drakegrasp.commissioning.draft.shapes import Shape, ellipsoid, read_mesh
-from drakegrasp.commissioning.draft.source import Source
 from drakegrasp.errors import HandError, one_line
+from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import Array, make_pose
+from drakegrasp.hand.draft.shapes import Shape, ellipsoid, read_mesh
+from drakegrasp.hand.draft.vendor import ENDLESS, Link, VendorJoint, VendorModel, motion
 from drakegrasp.hand.parsing import Mimic
-from drakegrasp.mesh.wavefront import obj_text
 
-#: Elements that are drawn only, and whose files are not read.
-_LOOKS = ("texture", "layer", "skin")
-#: Elements that make any number of bodies.
-_MADE = ("replicate", "flexcomp")
+#: Maximum size of a model's text [bytes].
+LONGEST = 20_000_000
 #: First group of shapes that MuJoCo does not draw unless it is asked to.
 HIDDEN = 3
 #: Colour of a shape whose model gives none: that of its material is drawn.
 _PLAIN = np.array([0.5, 0.5, 0.5, 1.0])
 
 
-def compile_parts(source: Source) -> Parts:
-    """Return the parts of an MJCF model.
+def compile_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
+    """Return the bodies and joints of an MJCF model.
+
+    Args:
+        path: The model.
+        find: Returns the file of a mesh, given the folder in which the model looks for it.
 
     Raises:
-        HandError: If MuJoCo is missing or rejects the file, or if the model has something that no
-            hand of rigid links has.
+        HandError: If MuJoCo is missing or rejects the file, a mesh cannot be read, or the model has
+            something that no hand of rigid links has.
     """
     try:
         import mujoco
@@ -51,77 +52,53 @@ def compile_parts(source: Source) -> Parts:
         raise HandError(
             "model: MJCF is read with MuJoCo, got none: pip install 'drakegrasp[peer]'"
         ) from None
-    with tempfile.TemporaryDirectory() as scratch:
-        path = _write(source, Path(scratch))
-        try:
-            model = mujoco.MjModel.from_xml_path(str(path))
-        except ValueError as error:
-            text = one_line(error).replace(f"{scratch}/", "")
-            raise HandError(f"model: must be MJCF that MuJoCo reads, got {text}") from None
-    if model.nflex:
-        raise HandError("model: must be of rigid bodies, got <flex>")
+    try:  # MuJoCo replaces NaN by its defaults
+        if found := re.search(rb"[\s\"']nan[\s\"']", read_content(path, LONGEST), re.I):
+            raise ValueError(f"{found[0].decode()!r}, which is no number")
+        spec = mujoco.MjSpec.from_file(str(path))
+        _read_meshes(spec, path.parent, find)
+        if spec.flexes:
+            raise HandError("model: must be of rigid bodies, got <flex>")
+        model = spec.compile()
+    except OSError as error:
+        raise HandError(f"{path}: must be a readable file, got: {error.strerror}") from None
+    except ValueError as error:
+        raise HandError(f"model: must be MJCF that MuJoCo reads, got {one_line(error)}") from None
 
-    # Bodies and joints without a name get one.
+    # Bodies and joints without a name get one. Body 0 is the world, which has no part in the hand.
     bodies = [model.body(b).name or f"body{b}" for b in range(model.nbody)]
-    joints = [model.joint(j).name or _joint_name(model, bodies, j) for j in range(model.njnt)]
-    for names in (bodies, joints):
-        if twins := sorted({name for name in names if names.count(name) > 1}):
-            raise HandError(f"model: names must be unique, got {twins[0]!r} twice")
-    carriers = list(_carriers(mujoco, model, bodies, joints))
-    mimics, notes = _mimics(mujoco, model, joints)
-    links: dict[Any, Link] = {}
+    names = [model.joint(j).name or _joint_name(model, bodies, j) for j in range(model.njnt)]
+    links, notes = dict[str, Link](), list[str]()
     for b in range(1, model.nbody):
-        links[b], left_out = _link(mujoco, model, b, bodies[b])
-        notes += left_out
-    for carrier in carriers:
-        bare = Link(name=f"{carrier.name}_end", inertia=SpatialInertia.Zero())
-        links.setdefault(carrier.child, bare)
-    return Parts(
-        name=model.names.partition(b"\0")[0].decode(),
-        bodies=links,
-        carriers=carriers,
-        efforts=_efforts(mujoco, model, joints),
-        mimics=mimics,
-        notes=notes,
-    )
+        links[bodies[b]] = _link(mujoco, model, b, bodies[b], notes)
+    efforts, joints = _efforts(mujoco, model, names), dict[str, VendorJoint]()
+    for joint in _joints(mujoco, model, bodies, names):
+        joints[joint.name] = replace(joint, effort=efforts.get(joint.name, 0.0))
+        links.setdefault(joint.child, Link(name=joint.child, inertia=SpatialInertia.Zero()))
+    for named in (bodies, names):
+        if twins := sorted({name for name in named if named.count(name) > 1}):
+            raise HandError(f"model: names must be unique, got {twins[0]!r} twice")
+    mimics = {mimic.joint: mimic for mimic in _mimics(mujoco, model, names, notes)}
+    name = model.names.partition(b"\0")[0].decode()
+    return VendorModel(name=name, links=links, joints=joints, mimics=mimics, notes=tuple(notes))
 
 
-def _write(source: Source, folder: Path) -> Path:
-    """Write a model, whose meshes become Wavefront files beside it; return its path.
+def _read_meshes(spec: Any, folder: Path, find: Callable[[str, Path], Path]) -> None:
+    """Give MuJoCo the triangles of mesh files, and nothing that is only drawn.
 
     Raises:
         HandError: If a mesh cannot be read.
     """
-    # The compiler element specifies the folder of the meshes.
-    root, base = source.root, source.folder
-    for compiler in root.iter("compiler"):
-        place = compiler.attrib.pop("meshdir", None) or compiler.attrib.pop("assetdir", None)
-        base = source.folder / place if place else base
-        for key in ("assetdir", "texturedir", "strippath"):
-            compiler.attrib.pop(key, None)
-    for element in list(root.iter()):
-        if element.tag in _MADE:
-            raise HandError(
-                f"model: must have its bodies written out, got <{element.tag}>: load and save it "
-                "with MuJoCo"
-            )
-        element.attrib.pop("texture", None)
-        for child in [child for child in element if child.tag in _LOOKS]:
-            element.remove(child)
-
-    # If a mesh has no name, its name is that of the file.
-    for n, mesh in enumerate(root.iterfind("asset/mesh")):
-        if file := mesh.get("file"):
-            shape = read_mesh(source.find(file, base))
+    for mesh in spec.meshes:
+        if mesh.file:
+            shape = read_mesh(find(mesh.file, folder / spec.meshdir))
             assert shape.vertices is not None and shape.faces is not None
-            text = obj_text(shape.vertices, shape.faces, normals=False)
-            (folder / f"{n}.obj").write_text(text, encoding="utf-8")
-            mesh.attrib.pop("content_type", None)
-            mesh.attrib.setdefault("name", Path(file).stem)
-            mesh.set("file", f"{n}.obj")
-    path = folder / "model.xml"
-    ElementTree.ElementTree(root).write(path, encoding="utf-8")
-    return path
+            mesh.uservert, mesh.userface = shape.vertices.ravel(), shape.faces.ravel()
+            mesh.file = mesh.content_type = ""
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for drawn in (*spec.textures, *spec.skins):
+        spec.delete(drawn)
 
 
 def _joint_name(model: Any, bodies: Sequence[str], j: int) -> str:
@@ -137,37 +114,37 @@ def _pose(p: Array, quaternion: Array) -> Array:
     return make_pose(R.matrix(), p)
 
 
-def _carriers(
-    mujoco: Any, model: Any, bodies: Sequence[str], joints: Sequence[str]
-) -> Iterator[Carrier]:
+def _joints(
+    mujoco: Any, model: Any, bodies: Sequence[str], names: Sequence[str]
+) -> Iterator[VendorJoint]:
     """Yield what carries each body. The hand is free, however the file fixes it to the world.
 
     A body with several joints has a body without mass between each two of them.
     """
     kinds = mujoco.mjtJoint
     for b in range(1, model.nbody):
-        parent: Any = int(model.body_parentid[b])
-        if parent == 0:
+        parent = bodies[model.body_parentid[b]]
+        if model.body_parentid[b] == 0:
             continue
         X_PB, first = _pose(model.body_pos[b], model.body_quat[b]), int(model.body_jntadr[b])
         last = first + int(model.body_jntnum[b]) - 1
         if last < first:
-            yield Carrier(name=bodies[b], parent=parent, child=b, X_PJ=X_PB, X_CJ=np.eye(4))
+            yield VendorJoint(name=bodies[b], parent=parent, child=bodies[b], X_PJ=X_PB)
         for j in range(first, last + 1):
             kind = kinds(int(model.jnt_type[j]))
             if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 raise HandError(
-                    f"model: joint {joints[j]!r} must be revolute, prismatic or fixed, got "
+                    f"model: joint {names[j]!r} must be revolute, prismatic or fixed, got "
                     f"{kind.name.removeprefix('mjJNT_').lower()}"
                 )
 
             # The body is at X_PB where the joint has the position of the model's reference.
-            child = b if j == last else (b, j)
+            child = bodies[b] if j == last else f"{names[j]}_end"
             axis, slides = model.jnt_axis[j].copy(), kind == kinds.mjJNT_SLIDE
             reference = float(model.qpos0[model.jnt_qposadr[j]])
             X_BJ = make_pose(np.eye(3), model.jnt_pos[j])
-            yield Carrier(
-                name=joints[j],
+            yield VendorJoint(
+                name=names[j],
                 parent=parent,
                 child=child,
                 X_PJ=X_PB @ X_BJ @ motion(axis, slides, -reference),
@@ -179,8 +156,8 @@ def _carriers(
             parent, X_PB = child, np.eye(4)
 
 
-def _link(mujoco: Any, model: Any, b: int, name: str) -> tuple[Link, list[str]]:
-    """Return a body with its shapes, and notes on the shapes that are left out."""
+def _link(mujoco: Any, model: Any, b: int, name: str, notes: list[str]) -> Link:
+    """Return a body with its shapes; `notes` receives a line for each shape that is left out."""
     mass, inertia = float(model.body_mass[b]), SpatialInertia.Zero()
     if not np.isfinite([mass, *model.body_inertia[b], *model.body_ipos[b]]).all():
         raise HandError(f"model: mass and inertia of body {name!r} must be finite numbers")
@@ -190,7 +167,7 @@ def _link(mujoco: Any, model: Any, b: int, name: str) -> tuple[Link, list[str]]:
         inertia = SpatialInertia.MakeFromCentralInertia(mass, model.body_ipos[b], central)
 
     # Shapes collide, are drawn, or both.
-    collisions, visuals, notes = [], [], list[str]()
+    collisions, visuals = [], []
     for g in np.flatnonzero(model.geom_bodyid == b).tolist():
         shape, rgba = _shape(mujoco, model, g), _colour(model, g)
         if shape is None:
@@ -201,8 +178,7 @@ def _link(mujoco: Any, model: Any, b: int, name: str) -> tuple[Link, list[str]]:
             collisions.append(shape)
         if model.geom_group[g] < HIDDEN and rgba[3] > 0.0:
             visuals.append(replace(shape, colour=rgba[:3]))
-    shapes = {"collisions": tuple(collisions), "visuals": tuple(visuals)}
-    return Link(name=name, inertia=inertia, **shapes), notes
+    return Link(name=name, inertia=inertia, collisions=tuple(collisions), visuals=tuple(visuals))
 
 
 def _shape(mujoco: Any, model: Any, g: int) -> Shape | None:
@@ -238,9 +214,8 @@ def _colour(model: Any, g: int) -> Array:
     return own
 
 
-def _mimics(mujoco: Any, model: Any, joints: Sequence[str]) -> tuple[list[Mimic], list[str]]:
-    """Return the active equalities of joints, and a note for each other active equality."""
-    mimics, notes = [], []
+def _mimics(mujoco: Any, model: Any, joints: Sequence[str], notes: list[str]) -> Iterator[Mimic]:
+    """Yield the active equalities of joints; `notes` receives a line for each other one."""
     for e in np.flatnonzero(model.eq_active0):
         kind = mujoco.mjtEq(int(model.eq_type[e]))
         if kind != mujoco.mjtEq.mjEQ_JOINT:
@@ -260,8 +235,7 @@ def _mimics(mujoco: Any, model: Any, joints: Sequence[str]) -> tuple[list[Mimic]
         # Equalities hold between displacements from the posture that the file draws.
         zero, start = (float(q) for q in model.qpos0[model.jnt_qposadr[[follower, led_by]]])
         offset += zero - ratio * start
-        mimics.append(Mimic(joint=name, leader=joints[led_by], ratio=ratio, offset=offset))
-    return mimics, notes
+        yield Mimic(joint=name, leader=joints[led_by], ratio=ratio, offset=offset)
 
 
 def _efforts(mujoco: Any, model: Any, joints: Sequence[str]) -> dict[str, float]:
@@ -279,7 +253,7 @@ def _efforts(mujoco: Any, model: Any, joints: Sequence[str]) -> dict[str, float]
         if model.jnt_actfrclimited[j]:
             most = model.jnt_actfrcrange[j]
             span = most if span is None else np.clip(span, *most)
-        if span is not None:
+        if span is not None and np.isfinite(span).all():
             efforts[joints[j]] = float(np.abs(span).max())
     return efforts
 

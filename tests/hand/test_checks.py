@@ -12,11 +12,11 @@ import yaml
 from helpers.hands import write_tongs
 from helpers.vendors import box, fixed, link
 
-from drakegrasp.commissioning.checks import Finding, check_pads, check_palm
-from drakegrasp.commissioning.trial_grasps import LINES, check_grasp, trial_grasps
+from drakegrasp.hand.checks import Finding, check_pads, check_palm
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.settings import load_config
+from drakegrasp.hand_setup.check import LINES, check_grasp, trial_grasps
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.trial import TrialRecord
 
@@ -43,20 +43,6 @@ def test_a_border_on_the_pads_face_is_moved_behind_it(tmp_path: Path) -> None:
         "got none: 3 mm are in [0.0, -1.0, 0.0, -0.003]"
     )
     assert checked([0.0, -1.0, 0.0, -0.003]).ok
-
-
-def test_a_jaw_that_opens_from_0_gets_a_new_zero_where_it_is_open(tmp_path: Path) -> None:
-    """The gripper as many vendors write it: closed at 0, a positive position opens."""
-    for name in ("franka_hand.yaml", "franka_hand.urdf"):
-        shutil.copy(MODELS / name, tmp_path)
-    model = tmp_path / "franka_hand.urdf"
-    text = model.read_text().replace('"0 1 0"', '"0 x 0"').replace('"0 -1 0"', '"0 1 0"')
-    text = text.replace('"0 x 0"', '"0 -1 0"').replace(" 0.04 0.0584", " 0 0.0584")
-    model.write_text(text.replace(" -0.04 0.0584", " 0 0.0584"))
-    assert (
-        "a positive position of joint 'left_joint' opens the hand, and it is closed at 0; reverse "
-        "its axis, move its origin by 0.04 m along the old axis, and take limits 0..0.04"
-    ) in check_pads(load_hand(tmp_path / "franka_hand.yaml")).text
 
 
 def test_a_palm_that_cannot_face_a_table_is_found(tmp_path: Path) -> None:
@@ -91,7 +77,7 @@ def test_a_ball_is_left_out_if_the_fingers_stand_wider_than_it() -> None:
 
 
 def outcome(monkeypatch: pytest.MonkeyPatch, record: Callable[..., TrialRecord]) -> Finding:
-    module = "drakegrasp.commissioning.trial_grasps"
+    module = "drakegrasp.hand_setup.check"
     monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)
     monkeypatch.setattr(f"{module}.run_attempt", record)
     return check_grasp(load_hand("franka"), load_config(), "box")

@@ -2,8 +2,11 @@
 
 Input: a model and a `Grip`. Output: poses X_BG, the best first. Gz is perpendicular to the line
 along which the fingers close, and no link is on the line from the palm along Gz to the place where
-the fingers pinch. Gy points to the
-finger that opposes the others.
+the fingers pinch. Gy points to the finger that opposes the others.
+
+The best frame faces along an axis of the palm link, or else as nearly as possible from the palm to
+the pinch. A frame comes last if its ray to the pinch does not come out of the palm, or if the hand
+reaches far beyond the pinch, where a table would be.
 """
 
 from __future__ import annotations
@@ -14,21 +17,18 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RollPitchYaw, RotationMatrix
 
-from drakegrasp.commissioning.checks import PALM_DEPTH, ray_end
-from drakegrasp.commissioning.draft.grips import Grip
-from drakegrasp.commissioning.draft.model import VendorModel
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
+from drakegrasp.hand.checks import PALM_DEPTH, ray_end
+from drakegrasp.hand.draft.grips import Grip
+from drakegrasp.hand.draft.vendor import VendorModel
 from drakegrasp.hand.shapes import ray_span
 
 #: Step between the tested directions [deg], and largest angle from an axis of the palm that is
 #: replaced by the axis.
 STEP_DEG, ALIGNED = 15, np.deg2rad(15.0)
-#: Smallest distance of the pinch in front of the palm [m].
-AHEAD = 0.015
-#: Costs: of an angle to the line from the palm to the pinch [1/rad]; of a link that reaches farther
-#: than `BEYOND` [m] beyond the pinch [1/m]; of facing no axis of the palm; of a palm beside the
-#: ray.
-ASIDE, BEYOND, FAR, OBLIQUE, BESIDE = 0.5, 0.03, 12.0, 0.15, 0.3
+#: Smallest distance of the pinch in front of the palm, and largest reach of the hand beyond the
+#: pinch [m].
+AHEAD, BEYOND = 0.015, 0.06
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,13 +39,14 @@ class PalmFrame:
         p_BG: (3,), origin of G in B [m].
         rpy_deg: (3,), roll, pitch and yaw of G in B [deg].
         height: Height of the pinch above the palm [m].
-        cost: How unusual the frame is.
+        rank: What it lacks, then its angle to the line from the palm to the pinch [rad]: the
+            smallest is the best.
     """
 
     p_BG: Array
     rpy_deg: Array
     height: float
-    cost: float
+    rank: tuple[int, float]
 
     @property
     def X_BG(self) -> Array:
@@ -104,13 +105,11 @@ def find_palm_frames(
                 p_BG=np.round(X_BG[:3, 3], 4) + 0.0,
                 rpy_deg=np.round(np.rad2deg(rpy), 1) + 0.0,
                 height=float((grip.middle - p_BG) @ direction),
-                cost=ASIDE * aside
-                + FAR * max(beyond - BEYOND, 0.0)
-                + OBLIQUE * oblique
-                + BESIDE * beside,
+                # An axis of the palm may be one step farther from the line.
+                rank=(int(beside) + int(beyond > BEYOND), aside + oblique * np.deg2rad(STEP_DEG)),
             )
         )
-    return sorted(frames, key=lambda frame: frame.cost)
+    return sorted(frames, key=lambda frame: frame.rank)
 
 
 def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple[Array, float]]:

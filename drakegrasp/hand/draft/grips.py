@@ -1,26 +1,35 @@
-"""Which fingers close against each other, where they touch, and whether other links collide first.
+"""Which fingers close against each other, and where they touch.
 
 Input: the joints of a model's fingers, and their closings. Output: `Grip`s, the best first: a
-finger, often a thumb, and one or two fingers that it meets. For each pair of fingers, all closings
-of both are compared. The pad of a fingertip is the part of its surface that faces the closing
-motion.
+finger, often a thumb, and one or two fingers that it meets. The pad of a fingertip is the part of
+its surface that faces the closing motion.
+
+For each pair of fingers, all closings of both are compared. In the posture in which their pads
+hold an object of `WIDTH`, with u the unit vector from one pad to the other, n the normals of the
+pads and m the directions in which they move as the fingers close, the best pair has the smallest
+
+    J = (∠(n₁, u) + ∠(m₁, u) + ∠(n₂, -u) + ∠(m₂, -u)) / 4 + |c₁ - c₂| + π · unmet + `REST` · away,
+
+because two forces hold an object if both lie along u and in the friction cones about the normals.
+c is the fraction by which a finger has closed: fingers that are not equally fast push the object
+away. `unmet` counts what the pinch lacks: an object of this width between the pads before the end
+of the closing; pads that meet when nothing is between them; an opening of `OPENING`; fingers that
+close as usual. `away` is how far other joints are from their rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from itertools import combinations
-from typing import TypeAlias
 
 import numpy as np
 
-from drakegrasp.commissioning.draft.fingers import STEPS, Closing
-from drakegrasp.commissioning.draft.model import VendorJoint, VendorModel
-from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.frames import Array, transform_points
+from drakegrasp.hand.draft.fingers import STEPS, Closing
+from drakegrasp.hand.draft.vendor import VendorJoint, VendorModel
 from drakegrasp.hand.finger_sweep import even_points
-from drakegrasp.hand.shapes import hull_planes, ray_span
+from drakegrasp.hand.overlaps import Overlap
+from drakegrasp.hand.shapes import ray_span
 
 #: A direction this close to an axis of the link is replaced by the axis [rad].
 SNAP = np.deg2rad(12.0)
@@ -29,35 +38,30 @@ SNAP = np.deg2rad(12.0)
 LENGTH, DEPTH, DEEP = 0.55, 0.45, (0.004, 0.008)
 #: Distance of the pad point from the end, in thicknesses, and its bounds [m].
 FROM_END, NEAR_END = 0.7, (0.004, 0.014)
-#: Spacing of points on the surface of a fingertip, and on shapes that are compared [m].
-SPACING, COMPARED = 0.0015, 0.006
-#: Width of the pinched object [m], and the deviation from it that costs nothing.
+#: Spacing of points on the surface of a fingertip [m].
+SPACING = 0.0015
+#: Width of the pinched object [m], and the largest deviation from it.
 WIDTH, TOLERANCE = 0.04, 0.01
-#: Cost if one finger has closed fully and the other not at all, if pads do not come close enough
-#: [1/m], and if they pinch at another width [1/m].
-UNEVEN, APART, OFF_WIDTH = 0.5, 20.0, 40.0
-#: Cost of a pad that passes the other pad instead of approaching it.
-PASSING = 0.5
-#: Fraction of the closing after which a pinch is late, cost of that; opening below which a grip is
-#: narrow [m], and cost of that [1/m].
-LATE, LATE_COST, OPENING, NARROW = 0.75, 2.0, 0.06, 10.0
-#: Pads that come this close to each other meet [m].
-MEETING = 0.006
-#: Angles by which a contact may be nearer to a fingertip's end than its pad [rad], and their cost.
-ROUND, ROUND_COST = np.deg2rad([0.0, 30.0, 60.0]), 0.2
+#: Fraction of the closing by which both fingers hold the object, smallest distance between the pads
+#: in the open hand [m], and largest distance between pads that meet [m].
+LATE, OPENING, MEETING = 0.75, 0.05, 0.008
+#: Cost of other joints away from their rest [1]: they may leave it by 10 degrees for each degree by
+#: which that straightens the pinch.
+REST = 0.1
+#: Angles by which a contact may be nearer to a fingertip's end than its pad [rad].
+ROUND = np.deg2rad([0.0, 30.0])
 #: A finger that turns about its own direction has no side by which it closes, as a cosine.
 SQUARE = 0.3
 #: Maximum number of grips that are returned.
 GRIPS = 40
 #: Maximum number of fingers that grasp; a hand with more fingers uses this many.
 FINGERS = 3
-#: Allowed overlap of links other than fingertips [m]; points miss a part of what Drake detects.
-SUNK = 2e-4
-_Ball: TypeAlias = tuple[Array, float]
+#: Allowed overlap of links other than fingertips [m].
+SUNK = 5e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Member:
+class Finger:
     """A finger that may be in a grip, with one of its closings, at s steps.
 
     Attributes:
@@ -100,23 +104,23 @@ class Grip:
     """Fingers that close against one finger.
 
     Attributes:
-        members: The fingers; the last one opposes the others.
+        fingers: The fingers; the last one opposes the others.
         step: Step of each finger at which an object of `WIDTH` is pinched.
-        cost: How far the pinch is from a straight and even pinch.
+        cost: J, the mean over the fingers that meet the last one [rad].
         axis: (3,), unit, from the fingers to the last one in the pinch, in the palm link.
         middle: (3,), centre between the fingers and the last one [m].
     """
 
-    members: tuple[Member, ...]
+    fingers: tuple[Finger, ...]
     step: tuple[int, ...]
     cost: float
     axis: Array
     middle: Array
 
 
-def find_members(
+def trace_finger(
     model: VendorModel, palm: str, joints: list[VendorJoint], closings: Sequence[Closing]
-) -> list[Member]:
+) -> list[Finger]:
     """Return a finger with the path of its pad, for each of its closings."""
     # The end of the fingertip, and its motion.
     last, link = joints[-1], model.links[joints[-1].child]
@@ -132,15 +136,15 @@ def find_members(
     if np.linalg.norm(front) < SQUARE:
         front = inside.mean(axis=0) - (inside.mean(axis=0) @ along) * along
     sides = {sign: _find_pad(parts, surface, sign * front, along) for sign in (1.0, -1.0)}
-    members = []
+    found = []
     for moved, X_BF, closing in zip(inside, X, closings, strict=True):
         *pad, region = sides[1.0 if moved @ front >= 0.0 else -1.0]
         place, normal, towards = ((X_BF[:, :3, :3] @ v[:, None])[..., 0] for v in pad)
         points = place + X_BF[:, :3, 3]
         moves = np.gradient(points, axis=0)
         first = int(np.flatnonzero(closing.gain)[0])
-        members.append(
-            Member(
+        found.append(
+            Finger(
                 joints=joints,
                 closing=closing,
                 joint=joints[first],
@@ -153,7 +157,7 @@ def find_members(
                 normals=np.stack([np.cos(r) * normal + np.sin(r) * towards for r in ROUND]),
             )
         )
-    return members
+    return found
 
 
 def _tip_poses(joints: Sequence[VendorJoint], q: Array) -> Array:
@@ -240,114 +244,98 @@ def _snapped(direction: Array) -> Array:
     return np.asarray(direction)
 
 
-def find_grips(fingers: Sequence[Sequence[Member]]) -> list[Grip]:
-    """Return the best grips of fingers against one of them.
+def find_grips(fingers: Sequence[Sequence[Finger]]) -> list[Grip]:
+    """Return the best grips of fingers against one of them, the best first.
 
     The other joints of fingers are at rest; only the finger that opposes may turn its other joints.
+
+    Args:
+        fingers: Each finger with each of its closings.
     """
-    # Compute the cost of each closing of the last finger with each closing of the others.
-    ranked: list[tuple[float, int, int, list[tuple[int, int]]]] = []
-    resting = [[m for m in ways if m.closing.at_rest] for ways in fingers]
+    resting = [[way for way in ways if way.closing.at_rest] for ways in fingers]
+    ranked: list[tuple[float, list[Finger], Finger]] = []
     for t, ways in enumerate(fingers):
-        others = [o for o in range(len(fingers)) if o != t]
-        costs = {o: _pair_costs(ways, resting[o]) for o in others}
-        for group in _alike(resting, others):
-            for b, last in enumerate(ways):
-                total, chosen = _cheapest(group, costs, b)
-                ranked.append((total + last.closing.cost, t, b, chosen))
-    ranked.sort(key=lambda entry: entry[:3])
+        others = [own for o, own in enumerate(resting) if o != t and own]
+        for last in ways:
+            pinches = [_pinch_costs(last, own).min(axis=(1, 2)) for own in others]
+            for group in _groups(others):
+                cost, chosen = _cheapest([pinches[o] for o in group])
+                ranked.append((cost, [others[group[i]][way] for i, way in chosen], last))
+    ranked.sort(key=lambda entry: entry[0])
 
     # Keep the best grips that differ in the last finger's positions.
-    grips: dict[tuple[int, tuple[float, ...]], Grip] = {}
-    for cost, t, b, chosen in ranked:
-        last = fingers[t][b]
-        key = t, tuple(np.round(last.closing.q0, 2).tolist())
+    grips: dict[tuple[str, tuple[float, ...]], Grip] = {}
+    for cost, chosen_fingers, last in ranked:
+        key = last.tip, tuple(np.round(last.closing.q0, 2).tolist())
         if key not in grips and len(grips) < GRIPS:
-            grips[key] = _grip([resting[o][a] for o, a in chosen], last, cost)
+            grips[key] = _grip(chosen_fingers, last, cost)
     return list(grips.values())
 
 
-def _alike(resting: Sequence[Sequence[Member]], others: Sequence[int]) -> list[list[int]]:
+def _groups(others: Sequence[Sequence[Finger]]) -> list[list[int]]:
     """Return groups of fingers that may close together: those with equally many closings."""
-    groups = [
-        [o for o in others if len(resting[o]) == count]
-        for count in sorted({len(resting[o]) for o in others})
-    ]
+    sizes = [len(ways) for ways in others]
+    groups = [[o for o, size in enumerate(sizes) if size == own] for own in sorted(set(sizes))]
     wanted = min(len(others), FINGERS - 1)
-    return [group for group in groups if len(group) >= wanted] or [list(others)]
+    return [group for group in groups if len(group) >= wanted] or [list(range(len(others)))]
 
 
-def _cheapest(
-    group: Sequence[int], costs: dict[int, Array], b: int
-) -> tuple[float, list[tuple[int, int]]]:
-    """Return the cheapest fingers of a group against one, with the same closing if possible."""
-    wanted = min(len(costs), FINGERS - 1)
-    rows = [costs[o][b] for o in group]
-    if len({len(row) for row in rows}) == 1:
-        table = np.array(rows)
-        best = np.sort(table, axis=0)[:wanted].mean(axis=0)
-        ways, total = np.full(len(rows), best.argmin()), float(best.min())
-        order = np.argsort(table[:, best.argmin()], kind="stable")[:wanted]
-    else:
-        least = np.array([row.min() for row in rows])
-        order = np.argsort(least, kind="stable")[:wanted]
-        ways, total = np.array([row.argmin() for row in rows]), float(least[order].mean())
-    return total, [(group[i], int(ways[i])) for i in sorted(order.tolist())]
-
-
-def _pair_costs(ways: Sequence[Member], others: Sequence[Member]) -> Array:
-    """Return the cost (b, a) of each closing of one finger with each closing of others."""
-    own = np.array([member.closing.cost for member in others])
-    stacked = (
-        np.stack([member.points for member in others]),
-        np.stack([member.moves for member in others]),
-        np.stack([member.normals for member in others], axis=1),
-    )
-    return np.stack([_costs(last, *stacked).min(axis=(1, 2)) + own for last in ways])
-
-
-def _costs(last: Member, points: Array, moves: Array, normals: Array) -> Array:
-    """Return the cost (a, s, s) of one closing of a finger with each closing of another, by steps.
+def _cheapest(pinches: Sequence[Array]) -> tuple[float, list[tuple[int, int]]]:
+    """Return the mean cost of the cheapest fingers of a group, each with the closing it has.
 
     Args:
-        last: The finger that opposes.
-        points: (a, s, 3), positions of the other finger's pad.
-        moves: (a, s, 3), unit directions in which that pad moves.
-        normals: (r, a, s, 3), directions that it faces.
+        pinches: For each finger the cost (a,) of each of its closings. If fingers have the same
+            closings, all of them take the same one.
     """
-    # Pads should face each other along the line between them.
-    line = last.points[None, None] - points[:, :, None]
+    ways = np.array([int(costs.argmin()) for costs in pinches])
+    wanted = min(len(pinches), FINGERS - 1)
+    if len({len(costs) for costs in pinches}) == 1:
+        ways[:] = np.sort(np.array(pinches), axis=0)[:wanted].mean(axis=0).argmin()
+    costs = np.array([own[way] for own, way in zip(pinches, ways, strict=True)])
+    order = np.argsort(costs, kind="stable")[:wanted]
+    return float(costs[order].mean()), [(i, int(ways[i])) for i in sorted(order.tolist())]
+
+
+def _pinch_costs(last: Finger, ways: Sequence[Finger]) -> Array:
+    """Return J (a, s, s) of one closing of a finger with each of `ways` of another, by steps [rad].
+
+    The steps are those of the other finger, then of the finger that opposes.
+    """
+    points, moves = (np.stack([getattr(w, key) for w in ways]) for key in ("points", "moves"))
+    line = last.points - points[:, :, None]
     gap = np.linalg.norm(line, axis=-1)
-    unit = line / np.maximum(gap, 1e-6)[..., None]
-    toll = ROUND_COST * ROUND[:, None, None, None]
-    facing = (np.einsum("rasi,asti->rast", normals, unit) - toll).max(axis=0)
-    faced = (-np.einsum("rti,asti->rast", last.normals, unit) - toll).max(axis=0)
-    nearing = np.einsum("asi,asti->ast", moves, unit)
-    neared = -np.einsum("ti,asti->ast", last.moves, unit)
+    u = line / np.maximum(gap, 1e-6)[..., None]
+    normals = np.stack([way.normals for way in ways])
+    cosines = [
+        np.einsum("arsi,asti->arst", normals, u).max(axis=1),
+        np.einsum("rti,asti->arst", last.normals, -u).max(axis=1),
+        np.einsum("asi,asti->ast", moves, u),
+        np.einsum("ti,asti->ast", last.moves, -u),
+    ]
+    angle = np.mean(np.arccos(np.clip(cosines, -1.0, 1.0)), axis=0)
+
+    # What the pinch lacks.
     share = np.linspace(0.0, 1.0, STEPS)
-    uneven = np.abs(share[:, None] - share[None])
-    off = np.maximum(np.abs(gap - WIDTH) - TOLERANCE, 0.0)
-
-    # Pads that pass at a distance never meet.
-    apart = np.maximum(gap.min(axis=(1, 2)) - MEETING, 0.0)
-    narrow = np.maximum(OPENING - gap[:, 0, 0], 0.0)
-    late = np.maximum(share - LATE, 0.0)
-    cost = 2.0 - facing - faced + UNEVEN * uneven + OFF_WIDTH * off
-    cost = cost + LATE_COST * (late[:, None] + late[None]) + PASSING * (2.0 - nearing - neared)
-    return np.asarray(cost + (APART * apart + NARROW * narrow)[:, None, None])
+    held = (np.abs(gap - WIDTH) <= TOLERANCE) & (np.maximum(share[:, None], share) <= LATE)
+    lacks = (gap.min(axis=(1, 2)) > MEETING).astype(float) + (gap[:, 0, 0] < OPENING)
+    lacks += float(not last.closing.usual) + np.array([not way.closing.usual for way in ways])
+    away = last.closing.away + np.array([way.closing.away for way in ways])
+    per_way = np.pi * lacks + REST * away
+    uneven = np.abs(share[:, None] - share)
+    return np.asarray(angle + uneven + np.pi * ~held + per_way[:, None, None])
 
 
-def _grip(others: Sequence[Member], last: Member, cost: float) -> Grip:
+def _grip(others: Sequence[Finger], last: Finger, cost: float) -> Grip:
     """Return the grip of some fingers against one, each with its closing."""
-    costs = [_costs(last, m.points[None], m.moves[None], m.normals[:, None])[0] for m in others]
-    at = int(np.stack(costs).min(axis=1).sum(axis=0).argmin())
-    steps = [int(table[:, at].argmin()) for table in costs]
+    tables = [_pinch_costs(last, [other])[0] for other in others]
+    at = int(np.stack(tables).min(axis=1).sum(axis=0).argmin())
+    steps = [int(table[:, at].argmin()) for table in tables]
 
     # The pad points in the pinch: the last finger's point, and the mean of the others.
-    points = np.array([m.points[s] for m, s in zip(others, steps, strict=True)])
+    points = np.array([other.points[s] for other, s in zip(others, steps, strict=True)])
     end, start = last.points[at], points.mean(axis=0)
     return Grip(
-        members=(*others, last),
+        fingers=(*others, last),
         step=(*steps, at),
         cost=cost,
         axis=(end - start) / np.linalg.norm(end - start),
@@ -355,71 +343,26 @@ def _grip(others: Sequence[Member], last: Member, cost: float) -> Grip:
     )
 
 
-def clear_grips(
-    model: VendorModel,
-    palm: str,
-    grips: Iterable[Grip],
-    postures: Callable[[Grip], Iterable[Mapping[str, float]]],
-) -> Iterator[Grip]:
-    """Yield the grips in which no links of two fingers overlap before their fingertips meet.
+def is_clear(
+    grip: Grip, postures: Iterable[Mapping[str, float]], overlaps: Callable[..., list[Overlap]]
+) -> bool:
+    """Return whether no links of two fingers overlap before two fingertips do.
 
     Args:
-        model: The model.
-        palm: Link B.
-        grips: The grips.
-        postures: Returns positions of all joints, from the open hand of a grip to the closed one.
+        grip: The grip.
+        postures: Positions of all joints, from the open hand of the grip to the closed one.
+        overlaps: Returns the overlaps of links at positions, see `hand.overlaps`.
     """
-
-    @cache
-    def shapes_of(link: str) -> tuple[_Ball, list[tuple[Array, Array, _Ball]]]:
-        """Return the ball around a link, and planes, points and the ball of each of its shapes."""
-        clouds = [even_points(s.corners(), COMPARED) for s in model.links[link].collisions]
-        whole = np.concatenate([np.zeros((1, 3)), *clouds])
-        return _ball(whole), [(hull_planes(points), points, _ball(points)) for points in clouds]
-
-    def overlap(a: str, b: str, X: Mapping[str, Array], depth: float) -> bool:
-        """Return whether a point of one link is deeper [m] than `depth` inside the other link."""
-        # Balls around whole links exclude most pairs.
-        X_AB = invert_pose(X[a]) @ X[b]
-        X_BA = invert_pose(X_AB)
-        (around_a, parts_a), (around_b, parts_b) = shapes_of(a), shapes_of(b)
-        return not _apart(X_AB, around_b, around_a) and any(
-            _inside(planes_a, transform_points(X_AB, points_b), depth)
-            or _inside(planes_b, transform_points(X_BA, points_a), depth)
-            for planes_a, points_a, ball_a in parts_a
-            for planes_b, points_b, ball_b in parts_b
-            if not _apart(X_AB, ball_b, ball_a)
-        )
-
-    def is_clear(grip: Grip) -> bool:
-        fingers = [[joint.child for joint in member.joints] for member in grip.members]
-        tips = {member.tip for member in grip.members}
-        pairs = [(a, b) for own, other in combinations(fingers, 2) for a in own for b in other]
-        for posture in postures(grip):
-            X = {name: model.pose(name, posture, palm) for finger in fingers for name in finger}
-            if any(overlap(a, b, X, 0.0) for a, b in pairs if {a, b} <= tips):
-                return True
-            if any(overlap(a, b, X, SUNK) for a, b in pairs if not {a, b} <= tips):
-                return False
-        return True
-
-    return filter(is_clear, grips)
-
-
-def _ball(points: Array) -> _Ball:
-    """Return the centre (3,) and the radius of a ball around points (n, 3) [m]."""
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    return centre, float(np.linalg.norm(points - centre, axis=1).max())
-
-
-def _apart(X_AB: Array, ball_B: _Ball, ball_A: _Ball) -> bool:
-    """Return whether two balls do not intersect."""
-    (p_BQ, radius_b), (p_AP, radius_a) = ball_B, ball_A
-    distance = np.linalg.norm(X_AB[:3, :3] @ p_BQ + X_AB[:3, 3] - p_AP)
-    return bool(distance > radius_a + radius_b)
-
-
-def _inside(planes: Array, points: Array, depth: float) -> bool:
-    """Return whether one of points (n, 3) is inside planes (m, 4) by more than a depth [m]."""
-    heights = points @ planes[:, :3].T + planes[:, 3]
-    return bool((heights.max(axis=1) < -depth).any())
+    owner = {joint.child: i for i, f in enumerate(grip.fingers) for joint in f.joints}
+    tips = {finger.tip for finger in grip.fingers}
+    for posture in postures:
+        met = [
+            (links, depth)
+            for links, depth in overlaps(posture)
+            if len({owner.get(link) for link in links} - {None}) == 2
+        ]
+        if any(tips.issuperset(links) for links, _ in met):
+            return True
+        if any(depth > SUNK for _, depth in met):
+            return False
+    return True

@@ -14,24 +14,24 @@ from helpers.machine import needs_egl
 from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_model
 
 from drakegrasp.cli.main import main
-from drakegrasp.commissioning.draft.fingers import Answers
-from drakegrasp.commissioning.draft.model import doubtful_units, read_model
-from drakegrasp.commissioning.draft.run import NewHand, draft_hand
-from drakegrasp.commissioning.draft.shapes import THIN, Shape
-from drakegrasp.commissioning.draft.source import read_source
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.draft.fingers import Answers
+from drakegrasp.hand.draft.shapes import THIN, Shape
+from drakegrasp.hand.draft.source import read_model
+from drakegrasp.hand.draft.vendor import doubtful_units
 from drakegrasp.hand.file_format import DrivenBy
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.finger_sweep import pad_points_at
 from drakegrasp.hand.kinematics import closed_positions, fingertip_forces
+from drakegrasp.hand_setup.new import NewHand, draft_hand
 
 
 @pytest.fixture(autouse=True)
 def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Geometry decides, but in tests that are marked."""
     if "sim" not in request.keywords:
-        monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
+        monkeypatch.setattr("drakegrasp.hand_setup.new.GRASPS", ())
 
 
 def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -> NewHand:
@@ -79,7 +79,7 @@ def test_units_that_no_hand_has_are_told(
         number = found[2] and str(factor * float(found[2]))
         return f"{found[1]}{number}{found[3]}"
 
-    model = read_model(read_source(write_model(tmp_path, re.sub(pattern, scaled, MITTEN)), {}))
+    model = read_model(write_model(tmp_path, re.sub(pattern, scaled, MITTEN)))
     doubts = list(doubtful_units(model))
     assert doubts == [] if doubt is None else re.match(doubt, doubts[0]) and len(doubts) == 1
 
@@ -172,18 +172,6 @@ def test_an_effort_that_no_motor_has_is_named_with_its_source(
         draft(tmp_path, text, effort=answer)
 
 
-def test_what_of_a_joints_range_is_not_used_is_noted(tmp_path: Path) -> None:
-    """Jaws whose zero is neither their open nor their closed end."""
-    assert draft(tmp_path / "whole", JAWS).notes == ()
-    text = JAWS.replace('lower="0" upper="0.05"', 'lower="-0.045" upper="0.005"')
-    text = text.replace('xyz="0 0 0"/><axis xyz="0 1', 'xyz="0 0.045 0"/><axis xyz="0 1')
-    text = text.replace('xyz="0 0 0"/><axis xyz="0 -1', 'xyz="0 -0.045 0"/><axis xyz="0 -1')
-    for side, note in zip(("left", "right"), sorted(draft(tmp_path, text).notes), strict=True):
-        assert note.startswith(
-            f"joint {side}_slide: the open hand is at 0 in the range -0.045..0.005 m, so 0.005 m"
-        )
-
-
 def test_a_finger_that_an_answer_drops_is_noted(tmp_path: Path) -> None:
     """Reversed it no longer closes as the others do."""
     text = MITTEN.replace('<mimic joint="middle_1" multiplier="0.8"/>', "")
@@ -191,7 +179,7 @@ def test_a_finger_that_an_answer_drops_is_noted(tmp_path: Path) -> None:
     tips = {finger.fingertip for finger in load_hand(drafted.path).fingers}
     assert tips == {"index_far", "thumb_far"}
     assert [note for note in drafted.notes if note.startswith("finger")] == [
-        "finger middle_far is not used: with middle_1 reversed none of its joints closes it"
+        "finger middle_far is not used: none of its joints closes it"
     ]
 
 
@@ -237,13 +225,16 @@ def test_a_licence_above_the_model_is_copied_and_told_of(tmp_path: Path) -> None
     assert not (draft_hand(model, tmp_path / "bare").path.parent / "LICENSE").exists()
 
 
-def test_each_guess_has_a_comment(tmp_path: Path) -> None:
-    text = draft(tmp_path, MITTEN).path.read_text()
-    told = r"\s*(#.*|version:.*|model:.*|palm:|preshape:|- name:.*|- \{joint.*)?"
-    bare = [line for line in text.splitlines() if "#" not in line]
-    assert [line for line in bare if not re.fullmatch(told, line)] == []
-    # And a head that says what to do.
+def test_guesses_have_reasons_above_them(tmp_path: Path) -> None:
+    """Of the keys that the file has, and of no others."""
+    text = draft(tmp_path, MITTEN, joints={"thumb_turn": 0.3}).path.read_text()
     assert text.startswith("# Drafted from hand.urdf by `drakegrasp hand new`.")
+    tree, told = yaml.safe_load(text), re.findall(r"^# ([a-z_.B-G]+\w*): ", text, re.MULTILINE)
+    keys = {*tree, *(f"fingers.{key}" for key in tree["fingers"][0])}
+    assert {*told} - {"look", "Units"} <= keys | {f"palm.{key}" for key in tree["palm"]} | {
+        "preshape.thumb_turn"
+    }
+    assert keys - {*told} == {"version", "model", "palm", "fingers.name"}
 
 
 def test_answers_override_guesses(tmp_path: Path) -> None:

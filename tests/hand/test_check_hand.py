@@ -11,10 +11,10 @@ from helpers.golden import Golden
 from helpers.hands import write_tongs
 from helpers.tiers import in_second_tier
 
-from drakegrasp.commissioning.checks import Finding
-from drakegrasp.commissioning.trial_grasps import check_hand
+from drakegrasp.hand.checks import Finding
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS, hand_names
+from drakegrasp.hand_setup.check import check_hand
 from drakegrasp.verification.wrist_problem import hand_constants
 
 
@@ -81,8 +81,7 @@ FAULTS = {
         r"limits of its coupled joints leave 0\.6\.\."),
     "wrong sign of a ratio that limits allow": (
         "allegro", ".yaml", "index_pip_joint, ratio: 1.0", "index_pip_joint, ratio: -1.0",
-        "fingertips", r"got that of index \d+ mm short; it does with the other sign of "
-        r"fingers\.0\.coupled\.0\.ratio \(index_pip_joint -1\)"),
+        "fingertips", r"got that of index \d+ mm short; check the signs of the ratios"),
     "pad region off the surface": (
         "barrett", ".yaml", f"{REGION}\n    {POINT}",
         "pad_region: [[1, 0, 0, 0.07]]\n    pad_point: [0.09, 0.0063, 0.0]", "files",
@@ -110,8 +109,7 @@ FAULTS = {
     "finger that opens": (
         "franka", ".urdf", '<axis xyz="0 1 0"/>', '<axis xyz="0 -1 0"/>', "pads",
         r"the pad of finger 'right' must face where the finger closes, got its back: a positive "
-        r"position of joint 'right_joint' opens the hand; reverse its axis, and keep limits "
-        r"0\.\.0\.04"),
+        r"position of joint 'right_joint' opens the hand: make it close from 0"),
     "another coupling in the model": (
         "allegro", ".sdf", "<xyz>0 1 0</xyz>\n        <limit><lower>-0.174",
         '<xyz>0 1 0</xyz><mimic joint="index_mcp_joint"><multiplier>-1</multiplier>'
@@ -133,30 +131,27 @@ FAULTS = {
 def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Files and geometry decide, but in tests that are marked."""
     if "sim" not in request.keywords:
-        monkeypatch.setattr("drakegrasp.commissioning.trial_grasps.GRASPS", ())
+        monkeypatch.setattr("drakegrasp.hand_setup.check.GRASPS", ())
 
 
-def refuse(path: Path, check: str, message: str) -> str:
-    """Check that one check of a hand fails, with a message of a line; return all findings."""
+def refuse(path: Path, check: str, message: str) -> None:
+    """Check that one check of a hand fails, with a message of a line."""
     findings = check_hand(path)
     (failed,) = (finding for finding in findings if not finding.ok)
     assert failed.name == check
     assert re.search(message, failed.text), failed.text
     assert "\n" not in failed.text
-    said = "\n".join(f"{finding.ok} {finding.name}: {finding.text}" for finding in findings)
-    return said.replace(str(path.parent), "FOLDER")
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_spoilt_hand_fails_with_a_message_that_names_the_fault(
-    tmp_path: Path, fault: str, golden: Golden
+    tmp_path: Path, fault: str
 ) -> None:
     """No other check fails, and none of these needs a simulation to be seen."""
     name, suffix, old, new, *found = FAULTS[fault]
     path = copied(tmp_path, name)
     change(path, suffix, old, new)
-    text = refuse(path, *found)
-    golden(f"faults/{re.sub('[^a-z0-9]+', '_', fault.lower())}", text)
+    refuse(path, *found)
 
 
 def test_a_mirrored_order_of_fingers_is_refused(tmp_path: Path) -> None:

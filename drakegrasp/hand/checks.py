@@ -7,18 +7,16 @@ files; palm, finger order, pads, and links that collide when the hand closes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.linalg import block_diag
 
 from drakegrasp.config import Config
 from drakegrasp.frames import Array, transform_points
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import FINGER_DAMPING, Hand
 from drakegrasp.hand.file_format import Coupling, Finger
 from drakegrasp.hand.finger_sweep import (
     Opposition,
@@ -26,7 +24,6 @@ from drakegrasp.hand.finger_sweep import (
     find_opposition,
     find_pinch,
     pad_fronts,
-    pad_points,
     pad_points_at,
     reach,
 )
@@ -35,9 +32,11 @@ from drakegrasp.hand.kinematics import (
     coordinate_limits,
     fingertip_forces,
     fingertip_poses,
+    joint_positions,
     link_poses,
     still_links,
 )
+from drakegrasp.hand.overlaps import overlap_query
 from drakegrasp.hand.parsing import (
     Mimic,
     add_model,
@@ -47,9 +46,6 @@ from drakegrasp.hand.parsing import (
     read_xml,
 )
 from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces, ray_span
-from drakegrasp.pictures.still_scene import Poses, StillScene
-from drakegrasp.simulation.construction import FINGER_DAMPING
-from drakegrasp.simulation.drive import drive_of
 
 #: Smallest range of a closing joint, in its unit; a smaller range does not close a hand.
 LEAST_RANGE = np.deg2rad(5.0)
@@ -64,8 +60,8 @@ MEETING = 0.008
 #: Largest reach of the hand beyond its pinch along +Gz [m]; with more, the palm cannot face a
 #: table.
 BEYOND_PINCH = 0.1
-#: Number of postures from the open to the closed hand, and of each of two fingers that meet.
-POSTURES, MEETING_STEPS = 40, 40
+#: Number of postures from the open to the closed hand.
+POSTURES = 40
 #: Links of different fingers may overlap by this before their fingertips meet [m].
 OVERLAP = 0.002
 #: Width of an object that every hand must be able to hold [m].
@@ -229,7 +225,7 @@ def check_efforts(hand: Hand, config: Config) -> Finding:
         )
     listed = ", ".join(f"{f:.3g}" for f in forces)
     carries = f"friction carries {carried:.2g} kg"
-    return judge("efforts", faults, f"{drive_of(hand, config.lift)}; {listed} N; {carries}")
+    return judge("efforts", faults, f"{config.lift.drive or hand.drive}; {listed} N; {carries}")
 
 
 def check_geometry(hand: Hand) -> Iterator[Finding]:
@@ -358,29 +354,11 @@ def _turned_round(hand: Hand, i: int) -> str:
     start = pad_points_at(hand, np.zeros(hand.num_fingers))
     moved = pad_points_at(hand, 0.1 * closed_positions(hand))
     others = np.delete(start, i, axis=0).mean(axis=0)
-    finger = hand.fingers[i]
     if np.linalg.norm(moved[i] - others) <= np.linalg.norm(start[i] - others):
         return "check the pad_region, and the axis of the closing joint"
-    lower, upper = hand.joint_limits[hand.joint_names.index(finger.closing_joint)]
-    mend = f"; reverse its axis, and keep limits {lower:g}..{upper:g}"
-
-    # A pad close to the others at 0 means that the hand is closed at 0, so that the new zero
-    # must be where the hand is open now.
-    away, travel = moved[i] - start[i], pad_points_at(hand, closed_positions(hand))[i] - start[i]
-    gap = float((start[i] - others) @ away / np.linalg.norm(away))
-    if gap < 0.5 * np.linalg.norm(travel):
-        shift = (
-            f"move its origin by {upper:g} m along"
-            if finger.slides
-            else (f"turn its origin by {upper:g} rad about")
-        )
-        mend = (
-            f", and it is closed at 0; reverse its axis, {shift} the old axis, and take limits "
-            f"0..{upper - lower:g}"
-        )
     return (
-        f"a positive position of joint {finger.closing_joint!r} opens the hand{mend}, or take "
-        "`drakegrasp hand new`"
+        f"a positive position of joint {hand.fingers[i].closing_joint!r} opens the hand: make it "
+        "close from 0 in the open hand, or take `drakegrasp hand new`"
     )
 
 
@@ -452,50 +430,19 @@ def check_meeting(hand: Hand) -> Finding:
         fault = "fingers must close against each other, got all of them in one direction: check "
         return judge("fingertips", [fault + "the axes of the closing joints"], "")
 
-    # Some pads must touch, each must reach those opposite, and an object must fit between them.
-    text = f"{' and '.join(first)} against {' and '.join(second)}"
-    gap, short = _least_gap(hand, group), _shortfall(hand, opposition)
-    if gap <= MEETING and (short <= MEETING).all() and find_pinch(hand, WIDTH) is not None:
-        return judge("fingertips", [], f"{text} meet within {1e3 * gap:.1f} mm")
-    text = f"pads of {text} must meet when they close"
-    for finger, missing in zip(hand.fingers, short, strict=True):
-        if missing > MEETING:
-            text += f", got that of {finger.name} {1e3 * missing:.0f} mm short"
-    if (short <= MEETING).all():
-        text += f", got {1e3 * gap:.0f} mm between them, or no posture that pinches"
-
-    # A coupling may have the wrong sign.
-    faults = [text]
-    for i in np.flatnonzero(short > MEETING).tolist():
-        for n, coupling in enumerate(hand.fingers[i].coupled):
-            other = _shortfall(_with_other_sign(hand, i, coupling.joint), opposition)
-            if other[i] <= MEETING:
-                faults.append(
-                    f"it does with the other sign of fingers.{i}.coupled.{n}.ratio "
-                    f"({coupling.joint} {coupling.ratio:+g})"
-                )
-    return judge("fingertips", faults, "")
-
-
-def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
-    """Return the smallest distance between a pad of one group and one of the other [m]."""
-    # The points of the pads in each posture of their own finger.
-    path = closing_path(hand, MEETING_STEPS)
-    X_GF = fingertip_poses(hand, spread=0.0, closing=path)
-    clouds = [
-        np.stack([transform_points(X, points) for X in X_GF[:, i]])
-        for i, points in enumerate(pad_points(hand))
-    ]
-
-    # Find the closest postures by the centres of the pads, then compute exact distances.
-    least = np.inf
-    for a, b in product(np.flatnonzero(group), np.flatnonzero(~group)):
-        middles = clouds[a].mean(axis=1)[:, None] - clouds[b].mean(axis=1)[None]
-        near = np.argsort(np.linalg.norm(middles, axis=2), axis=None)[:20]
-        for i, j in zip(*np.unravel_index(near, (MEETING_STEPS, MEETING_STEPS)), strict=True):
-            between = clouds[a][i][:, None] - clouds[b][j][None]
-            least = min(least, float(np.linalg.norm(between, axis=2).min()))
-    return least
+    # Each pad must reach those opposite, and an object must fit between them.
+    text, short = (
+        f"{' and '.join(first)} against {' and '.join(second)}",
+        _shortfall(hand, opposition),
+    )
+    missing = {f.name: 1e3 * s for f, s in zip(hand.fingers, short, strict=True) if s > MEETING}
+    if not missing and find_pinch(hand, WIDTH) is not None:
+        return judge("fingertips", [], f"{text} meet")
+    got = ", ".join(f"that of {name} {gap:.0f} mm short" for name, gap in missing.items())
+    fault = f"pads of {text} must meet when they close, got {got or 'no posture that pinches'}"
+    if any(finger.coupled for finger in hand.fingers if finger.name in missing):
+        fault += "; check the signs of the ratios of coupled joints"
+    return judge("fingertips", [fault], "")
 
 
 def _shortfall(hand: Hand, opposition: Opposition) -> Array:
@@ -506,31 +453,20 @@ def _shortfall(hand: Hand, opposition: Opposition) -> Array:
     return np.asarray(opposite - reached)
 
 
-def _with_other_sign(hand: Hand, finger: int, joint: str) -> Hand:
-    """Return a hand in which a coupled joint of a finger turns in the opposite direction."""
-    # The gain of the joint occurs among all joints and in the chain of its fingertip.
-    signs = np.where(np.array(hand.joint_names) == joint, -1.0, 1.0)
-    chains, chain = list(hand.chains), hand.chains[finger]
-    own = np.where(np.array(chain.joints) == joint, -1.0, 1.0)
-    chains[finger] = replace(chain, gain=own[:, None] * chain.gain)
-    return replace(hand, joint_gain=signs[:, None] * hand.joint_gain, chains=tuple(chains))
-
-
 def check_overlaps(hand: Hand) -> Finding:
     """Return whether only fingertips of different fingers meet until the hand is closed.
 
     In the simulation, other links pass through each other, so they must not touch.
     """
     # Find the finger whose closing moves each link: 1 for the first finger, 0 for no finger.
-    scene, faults = StillScene(hand), dict[str, float]()
+    overlaps, faults = overlap_query(hand.model, hand.palm_link), dict[str, float]()
     moves = {link: chain.gain[:, 1:].any(axis=0) for link, chain in hand.link_chains.items()}
     movers = {link: 1 + int(by.argmax()) if by.any() else 0 for link, by in moves.items()}
 
     # Close the hand step by step, until two fingertips meet.
     for closing in closing_path(hand, POSTURES):
-        scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(0.0, closing)))
         met = False
-        for links, depth in scene.overlaps():
+        for links, depth in overlaps(joint_positions(hand, 0.0, closing)):
             # A link above the palm is not in the palm's tree, and fingers do not move it.
             one, other = (movers.get(link, 0) for link in links)
             if not one or not other or one == other:

@@ -17,7 +17,10 @@ from typing import TypeAlias
 import numpy as np
 import trimesh
 
-from drakegrasp.commissioning.checks import (
+from drakegrasp.config import Config, ObjectConfig, with_whole_lifts
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.hand.checks import (
     Finding,
     check_couplings,
     check_efforts,
@@ -26,9 +29,6 @@ from drakegrasp.commissioning.checks import (
     check_masses,
     judge,
 )
-from drakegrasp.config import Config, ObjectConfig, with_whole_lifts
-from drakegrasp.errors import HandError
-from drakegrasp.frames import Array, make_pose, rotation_about
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Drive
 from drakegrasp.hand.finger_sweep import Pinch, find_opposition, find_pinch, reach

@@ -15,9 +15,9 @@ from itertools import product
 
 import numpy as np
 
-from drakegrasp.commissioning.draft.model import VendorJoint, VendorModel
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
+from drakegrasp.hand.draft.vendor import VendorJoint, VendorModel
 
 #: Cosine above which two axes are parallel.
 PARALLEL = 0.94
@@ -26,14 +26,13 @@ PARALLEL = 0.94
 WIDE, POSITIONS = 0.8, 5
 #: Ratios of the second and later bending joints to the first, if each has a motor.
 RATIOS = {2: ((1.0,), (0.5,)), 3: ((1.0, 0.5), (1.0, 1.0), (0.5, 0.25))}
-#: Positions of the second bending joint in the open hand [rad], and their cost [1/rad].
-BENT, BENT_COST = (0.0, 0.3), 0.1
-#: Cost of a start that is not zero, of closing in the smaller part of a range, and of another joint
-#: away from its rest [1/rad].
-NOT_ZERO, SMALLER, AWAY = 1.0, 0.6, 0.08
-#: Smallest motion of a closing joint, turning [rad] and sliding [m]; assumed motion of a joint
-#: without limits [rad].
+#: Positions of the second bending joint in the open hand [rad].
+BENT = (0.0, 0.3)
+#: Smallest motion of a closing joint, turning [rad] and sliding [m]; assumed motion of a turning
+#: joint without limits [rad].
 LEAST, UNLIMITED = {False: 0.15, True: 0.004}, np.pi / 2.0
+#: Fraction of its range through which a finger usually closes.
+MOST = 0.5
 #: Number of postures from open to closed.
 STEPS = 12
 #: A link of the same motor is not a finger if it reaches less than this fraction of the farthest.
@@ -64,6 +63,22 @@ class Answers:
     effort: float | None = None
     settings: tuple[str, ...] = ()
 
+    def refuse_unknown(self, model: VendorModel) -> None:
+        """Reject answers about joints that the model does not have.
+
+        Raises:
+            HandError: If there are any.
+        """
+        for option, names in (("--joint", self.joints), ("--reverse", self.reverse)):
+            for name in names:
+                if name not in model.joints:
+                    joints = ", ".join(model.joints)
+                    raise HandError(f"{option} must name one of {joints}, got {name!r}")
+        for name, position in self.joints.items():
+            lower, upper = model.joints[name].limits
+            if not lower <= position <= upper:
+                raise HandError(f"--joint {name} must be {lower:g}..{upper:g}, got {position:g}")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Closing:
@@ -74,7 +89,9 @@ class Closing:
         limit: Closing at which a joint reaches its own limit [rad or m].
         preshape: Position of each joint that does not close and follows no other joint.
         at_rest: Whether those joints are as near to zero as possible.
-        cost: How unusual the closing is.
+        usual: Whether the finger is open at zero and closes through most of its range.
+        away: Sum of the positions that the other joints, and bent ones, keep in the open hand
+            [rad or m].
     """
 
     q0: Array
@@ -82,7 +99,8 @@ class Closing:
     limit: float
     preshape: dict[str, float] = field(default_factory=dict)
     at_rest: bool = True
-    cost: float = 0.0
+    usual: bool = True
+    away: float = 0.0
 
     def path(self) -> Array:
         """Return the positions (`STEPS`, m) from open to closed."""
@@ -206,9 +224,9 @@ def find_closings(
                 for j, ratio, offset in moved:
                     q0[j] = np.clip(ratio * position + offset, *joints[j].limits)
             preshape = dict(zip(kept, positions, strict=True))
-            away, at_rest = AWAY * float(np.abs(positions).sum()), positions == rests
+            away, at_rest = float(np.abs(positions).sum()), positions == rests
             found += [
-                replace(b, q0=q0 + b.q0, preshape=preshape, at_rest=at_rest, cost=b.cost + away)
+                replace(b, q0=q0 + b.q0, preshape=preshape, at_rest=at_rest, away=b.away + away)
                 for b in bends
             ]
     return found
@@ -245,8 +263,7 @@ def _bends(
     start = max(0.0, low) if from_zero else low
     if high - start < LEAST[slides]:
         return []
-    cost = SMALLER * (1.0 - (high - start) / max(high - low, 1e-9))
-    cost += 0.0 if from_zero or slides else NOT_ZERO
+    usual = (from_zero or slides) and high - start >= MOST * (high - low)
 
     # The other motors follow in usual ratios, or each through its whole range.
     whole = tuple((top - max(0.0, bottom)) / (high - start) for _, bottom, top in spans[1:])
@@ -260,8 +277,7 @@ def _bends(
             for j, r, offset in moved:
                 q0[j], gain[j] = r * at + offset, r * ratio
         if limit > 0.5 * min(high - start, 1.0):
-            bend_cost = cost + BENT_COST * bent
-            found.append(Closing(q0=q0, gain=gain, limit=float(limit), cost=bend_cost))
+            found.append(Closing(q0=q0, gain=gain, limit=float(limit), usual=usual, away=bent))
     return found
 
 
@@ -272,8 +288,8 @@ def _span(
     _, ratio, offset = moved[0]
     own, ends = [(j, r / ratio, o - offset * r / ratio) for j, r, o in moved], []
     for j, r, o in own:
-        limits = joints[j].limits
-        finite = np.where(np.isfinite(limits), limits, [-UNLIMITED, UNLIMITED])
+        limits, most = joints[j].limits, 0.0 if joints[j].slides else UNLIMITED
+        finite = np.where(np.isfinite(limits), limits, [-most, most])
         ends.append(np.sort((finite - o) / r))
     low, high = np.sort(np.array([np.max(ends, axis=0)[0], np.min(ends, axis=0)[1]]) * sense)
     return [(j, r * sense, o) for j, r, o in own], float(low), float(high)

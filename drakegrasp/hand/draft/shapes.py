@@ -1,19 +1,16 @@
 """Shapes of a vendor's links: primitives of Drake, and meshes of many formats.
 
-Input: the XML of a model, the mesh files that it names, and the shapes that Drake parsed. Output:
-XML that names Wavefront files of a scratch folder, which Drake can read, and `Shape`s on the links.
-A shape that is not a primitive becomes triangles, few enough to be drawn quickly. A collision shape
-becomes a convex hull.
+Input: mesh files, and shapes that Drake parsed. Output: `Shape`s on the links. A shape that is not
+a primitive becomes triangles, few enough to be drawn quickly. A collision shape becomes a convex
+hull.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import fast_simplification
 import numpy as np
@@ -32,16 +29,13 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.multibody.tree import CalcSpatialInertia, SpatialInertia
-from scipy.spatial import cKDTree
 
 from drakegrasp.arithmetic import dot
-from drakegrasp.commissioning.draft.source import Source
 from drakegrasp.errors import HandError, MeshError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.shapes import ball_corners, hull_corners, primitive_corners
 from drakegrasp.mesh.loading import join_scene, load_scene
 from drakegrasp.mesh.surfaces import Faces
-from drakegrasp.mesh.wavefront import obj_text
 
 #: Number of faces to which larger meshes are simplified.
 MOST_FACES = 8_000
@@ -52,9 +46,6 @@ DARKEST = 0.15
 CORNERS = 64
 #: Minimum thickness of a hull [m]: a plane has no hull.
 THIN = 4e-4
-#: Number of points on a hull that are compared with ten times as many points of its mesh, which are
-#: about 3 mm apart on a palm.
-SAMPLES = 1000
 #: Mean density of links whose model gives no mass [kg/m^3]; own choice, that of solid plastic.
 DENSITY = 1200.0
 
@@ -106,14 +97,6 @@ class Shape:
         )
         return replace(self, vertices=vertices.astype(float), faces=faces.astype(np.int64))
 
-    def reach_beyond(self, mesh: Shape) -> float:
-        """Return the largest distance of the surface of a hull from that of its mesh [m]."""
-        (own, _), (other, _) = (
-            trimesh.sample.sample_surface(trimesh.Trimesh(s.vertices, s.faces), count, seed=0)
-            for s, count in ((self, SAMPLES), (mesh, 10 * SAMPLES))
-        )
-        return float(cKDTree(other).query(own)[0].max())
-
 
 def _with_hull(shape: Shape, points: Array) -> Shape:
     """Return a shape whose mesh is the convex hull of points (n, 3)."""
@@ -125,15 +108,20 @@ def read_shape(
     inspector: SceneGraphInspector,
     geometry: GeometryId,
     role: Role,
-    meshes: Mapping[str, Shape],
+    meshes: Mapping[str, Shape | HandError],
+    notes: list[str],
 ) -> Shape | None:
-    """Return a shape that Drake parsed, on its body; None for a shape without bounds.
+    """Return a shape that Drake parsed, on its body; None if it has no bounds or is not drawn.
 
     Args:
         inspector: The inspector of the scene graph.
         geometry: The shape.
         role: Whether the shape is drawn or collides.
-        meshes: Contents of the mesh files, by their names.
+        meshes: Contents of the mesh files, or why they cannot be read, by the names that Drake has.
+        notes: Receives why a shape is not drawn; the collision shapes are drawn in its place.
+
+    Raises:
+        HandError: If the mesh of a collision shape cannot be read.
     """
     # Read its kind, and the colour that the model gives it.
     shape, colour = inspector.GetShape(geometry), None
@@ -148,6 +136,11 @@ def read_shape(
     # Other shapes become triangles: those of the file, or of the hull.
     if isinstance(shape, Mesh | Convex) and shape.source().is_path():
         mesh = meshes[shape.source().path().name]
+        if isinstance(mesh, HandError):
+            if role == Role.kProximity:
+                raise mesh
+            notes.append(f"not drawn: {str(mesh).removeprefix('model: ')}")
+            return None
         assert mesh.vertices is not None
         vertices = mesh.vertices * np.asarray(shape.scale3())
         colour = mesh.colour if colour is None else colour
@@ -189,56 +182,6 @@ def added(one: SpatialInertia, other: SpatialInertia) -> SpatialInertia:
     total = one.Shift(np.zeros(3))
     total += other
     return total
-
-
-def replace_meshes(source: Source, folder: Path) -> tuple[dict[str, Shape], list[str]]:
-    """Replace every mesh in the XML of a URDF or SDFormat model by a Wavefront file in a folder.
-
-    A visual shape that cannot be read is left out; the collision shapes are drawn instead.
-
-    Returns:
-        The contents of the files by their names, and notes of what was left out.
-
-    Raises:
-        HandError: If a mesh of a collision shape cannot be read.
-    """
-    files: dict[str, Shape] = {}
-
-    def convert(uri: str) -> str:
-        path = source.find(uri, source.folder)
-        name = f"{hashlib.sha256(str(path).encode()).hexdigest()[:16]}.obj"
-        if name not in files:
-            files[name] = read_mesh(path)
-            # Drake must find a file, but its triangles are not used.
-            few = files[name].simplified()
-            assert few.vertices is not None and few.faces is not None
-            text = obj_text(few.vertices, few.faces, normals=False)
-            (folder / name).write_text(text, encoding="utf-8")
-        return name
-
-    notes: list[str] = []
-    for link in source.root.iter("link"):
-        for shape in [*link.findall("collision"), *link.findall("visual")]:
-            try:
-                for mesh in shape.iter("mesh"):
-                    _replace(mesh, source, convert)
-            except HandError as error:
-                if shape.tag == "collision":
-                    raise
-                notes.append(f"not drawn: {str(error).removeprefix('model: ')}")
-                link.remove(shape)
-    return files, notes
-
-
-def _replace(mesh: Element, source: Source, convert: Callable[[str], str]) -> None:
-    """Change the file that a mesh element of a URDF or SDFormat model names."""
-    if source.root.tag == "robot":
-        mesh.set("filename", convert(mesh.get("filename", "")))
-        return
-    uri = mesh.find("uri")
-    if uri is None or mesh.find("submesh") is not None:
-        raise HandError("model: a mesh must be a whole file, got <submesh> or no <uri>")
-    uri.text = convert((uri.text or "").strip())
 
 
 def read_mesh(path: Path) -> Shape:

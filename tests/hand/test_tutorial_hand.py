@@ -12,8 +12,8 @@ from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 
 from drakegrasp.cli.main import main
-from drakegrasp.commissioning import trial_grasps
 from drakegrasp.hand.file_format import Coupling, Finger, HandFile, Palm, Spread
+from drakegrasp.hand_setup import check as trial_grasps
 
 PAGE = PATH.read_text()
 
