@@ -6,7 +6,7 @@ files; palm, finger order, pads, and links that collide when the hand closes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from drakegrasp.config import Config
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.description import FINGER_DAMPING, Hand
-from drakegrasp.hand.file_format import Coupling, Finger
+from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.finger_sweep import (
     Opposition,
     closing_path,
@@ -125,17 +125,11 @@ def check_limits(hand: Hand) -> Finding:
             faults.append(f"{joint} must have limits, {got}")
         elif not (own[0] <= 0.0 and own[1] >= LEAST_RANGE * unit):
             faults.append(f"{joint} must reach from 0, the open hand, to a positive limit, {got}")
-        elif lower > SAME * unit:
-            offsets = ", ".join(f"{c.joint} by {c.offset:g}" for c in finger.coupled)
+        elif lower > SAME * unit or upper < LEAST_RANGE * unit:
+            rules = ", ".join(f"{c.joint} by {c.ratio:g} and {c.offset:g}" for c in finger.coupled)
             faults.append(
-                f"finger {finger.name!r} must be open at 0, but with their offsets ({offsets}) "
-                f"limits of its coupled joints leave {left}"
-            )
-        elif upper < LEAST_RANGE * unit:
-            ratios = ", ".join(f"{c.joint} by {c.ratio:g}" for c in finger.coupled)
-            faults.append(
-                f"finger {finger.name!r} must be able to close, but limits of its coupled joints "
-                f"({ratios}) leave {left}: check the signs of the ratios"
+                f"finger {finger.name!r} must be open at 0 and able to close, but limits of its "
+                f"coupled joints ({rules}) leave {left}: check signs of ratios, and offsets"
             )
         shown = f"{1e3 * upper:.0f} mm" if finger.slides else f"{np.rad2deg(upper):.0f}°"
         ranges.append(f"{finger.name} {shown}")
@@ -150,35 +144,26 @@ def check_limits(hand: Hand) -> Finding:
 
 def check_couplings(hand: Hand) -> Finding:
     """Return whether the couplings agree with those of the model, if the model has any."""
-    # The closing joint that each joint follows, according to the hand file.
-    own = {c.joint: (f.closing_joint, c) for f in hand.fingers for c in f.coupled}
-    mimics = declared_mimics(read_xml(hand.model.path))
-    faults = [_coupling_fault(hand, own, m) for m in mimics if not _moves_as(hand, m)]
-    joints = ", ".join(f"{joint} {c.ratio:+g}" for joint, (_, c) in own.items())
-    return judge("couplings", faults, joints or "none")
+    closes, faults = {finger.closing_joint: finger.name for finger in hand.fingers}, []
+    for mimic in declared_mimics(read_xml(hand.model.path)):
+        if _moves_as(hand, mimic):
+            continue
 
-
-def _coupling_fault(hand: Hand, own: Mapping[str, tuple[str, Coupling]], mimic: Mimic) -> str:
-    """Return the fault of a hand that does not move according to a coupling of its model."""
-    # One motor may move two fingers in the model.
-    closes = {finger.closing_joint: finger.name for finger in hand.fingers}
-    if {mimic.joint, mimic.leader} <= set(closes) and mimic.ratio > 0.0:
-        i, leader = list(closes).index(mimic.joint), closes[mimic.leader]
-        return (
-            f"fingers.{i}.driven_by must be {{finger: {leader}, ratio: {mimic.ratio:g}}} in place "
-            "of a motor of its own: in the model one moves both"
-        )
-    if mimic.joint not in own:
-        return (
-            f"joint {mimic.joint!r} must be coupled to {mimic.leader!r} by {mimic.ratio:g} and "
-            f"{mimic.offset:g}, as in the model"
-        )
-    leader, coupling = own[mimic.joint]
-    return (
-        f"joint {mimic.joint!r} must follow {mimic.leader!r} by {mimic.ratio:g} and "
-        f"{mimic.offset:g} as in the model, got {leader!r} by {coupling.ratio:g} and "
-        f"{coupling.offset:g}"
-    )
+        # One motor may move two fingers in the model.
+        ratio, leader = mimic.ratio, mimic.leader
+        if {mimic.joint, leader} <= set(closes) and ratio > 0.0:
+            i = list(closes).index(mimic.joint)
+            faults.append(
+                f"fingers.{i}.driven_by must be {{finger: {closes[leader]}, ratio: {ratio:g}}} in "
+                "place of a motor of its own: in the model one moves both"
+            )
+        else:
+            faults.append(
+                f"joint {mimic.joint!r} must be coupled to {leader!r} by {ratio:g} and "
+                f"{mimic.offset:g}, as in the model"
+            )
+    own = [f"{c.joint} {c.ratio:+g}" for finger in hand.fingers for c in finger.coupled]
+    return judge("couplings", faults, ", ".join(own) or "none")
 
 
 def _moves_as(hand: Hand, mimic: Mimic) -> bool:

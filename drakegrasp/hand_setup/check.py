@@ -78,6 +78,8 @@ _SOFT = (
 #: How to repair a hand that loses the object, and hands with other failures, by their labels.
 _LOST = "pads must face each other where they meet, and motors press enough (efforts)"
 _MENDS = {
+    Outcome.MISSING_FINGERTIP.label: "fingertips must touch it within the pad_region; let the "
+    "region reach 3 mm behind its face and to the end of the finger",
     Outcome.HAND_CONTACT.label: "other links touch it first; open the hand wider, or move the palm "
     "back (p_BG)",
     Outcome.START_COLLISION.label: "the open hand is in its way; keep fingers that do not grasp "
@@ -110,16 +112,12 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
     rules: Drive = "locked" if drive == "torque" else drive
     locked = config.model_copy(update={"lift": config.lift.model_copy(update={"drive": rules})})
     outcomes: Counter[str] = Counter()
-    missing: Counter[str] = Counter()
     for model, X_TO, pregrasp, width in trial_grasps(hand, shape, line):
         scene = build_scene(model, config.physics, hand)
         record = run_attempt(scene, X_TO, pregrasp, locked)
         if not _stays(record, config):
             held = record.outcome is Outcome.SUCCESS
             outcomes[MOVED if held else record.outcome.label] += 1
-            if record.closed is not None:
-                rows = zip(hand.fingers, record.closed.contacts.touching, strict=True)
-                missing.update(finger.name for finger, touches in rows if not touches)
             continue
         text = (
             f"holds {1e3 * width:.0f} mm and {model.mass:g} kg; {_slip(record)} with "
@@ -134,7 +132,7 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
 
     tried = ", ".join(f"{count} {label}" for label, count in outcomes.items())
     text = f"a {shape} must be held, got {tried or 'no posture that holds one'}"
-    mend = _mend(outcomes, missing)
+    mend = _MENDS.get(outcomes.most_common(1)[0][0]) if outcomes else None
     return judge(name, [f"{text}: {mend}" if mend else text], "")
 
 
@@ -147,18 +145,6 @@ def _stands_wide(hand: Hand) -> bool:
     across = np.cross([0.0, 0.0, 1.0], axis)
     aside = np.abs((pinch.p_GQ - pinch.p_GM) @ across).max()
     return bool(aside > WIDEST * pinch.width)
-
-
-def _mend(outcomes: Counter[str], missing: Counter[str]) -> str:
-    """Return how to repair a hand whose trial grasps fail; empty if unknown."""
-    label = outcomes.most_common(1)[0][0] if outcomes else ""
-    if label == Outcome.MISSING_FINGERTIP.label and missing:
-        return (
-            f"{', '.join(missing)} must touch it within the pad_region, which contact elsewhere on "
-            "the link misses; let the region reach 3 mm behind its face and to the end of the "
-            "finger"
-        )
-    return _MENDS.get(label, "")
 
 
 def _stays(record: TrialRecord, config: Config) -> bool:

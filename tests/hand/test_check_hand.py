@@ -73,12 +73,12 @@ FAULTS = {
         "barrett", ".sdf", "barrett_distal.obj", "gone.obj", "files", r"model: .*gone\.obj"),
     "wrong sign of a ratio that limits catch": (
         "barrett", ".yaml", RATIO, RATIO.replace("0.3", "-0.3"), "limits",
-        r"finger 'F1' must be able to close, but limits of its coupled joints "
-        r"\(finger1_distal_joint by -0\.333333\) leave .*: check the signs of the ratios"),
+        r"finger 'F1' must be open at 0 and able to close, but limits of its coupled joints "
+        r"\(finger1_distal_joint by -0\.333333 and 0\) leave .*: check signs of ratios"),
     "offset that opens too far": (
         "barrett", ".yaml", RATIO, f"{RATIO}, offset: -0.2", "limits",
-        r"finger 'F1' must be open at 0, but with their offsets \(finger1_distal_joint by -0\.2\) "
-        r"limits of its coupled joints leave 0\.6\.\."),
+        r"finger 'F1' must be open at 0 and able to close, but limits of its coupled joints "
+        r"\(finger1_distal_joint by 0\.333333 and -0\.2\) leave 0\.6\.\."),
     "wrong sign of a ratio that limits allow": (
         "allegro", ".yaml", "index_pip_joint, ratio: 1.0", "index_pip_joint, ratio: -1.0",
         "fingertips", r"got that of index \d+ mm short; check the signs of the ratios"),
@@ -115,8 +115,7 @@ FAULTS = {
         '<xyz>0 1 0</xyz><mimic joint="index_mcp_joint"><multiplier>-1</multiplier>'
         "<offset>0.2</offset><reference>0</reference></mimic>\n        <limit><lower>-0.174",
         "couplings",
-        r"joint 'index_pip_joint' must follow 'index_mcp_joint' by -1 and 0\.2 as in the model, "
-        r"got 'index_mcp_joint' by 1 and 0\.2"),
+        r"joint 'index_pip_joint' must be coupled to 'index_mcp_joint' by -1 and 0\.2, as in"),
     "inertia of a body that is too long": (
         "franka", ".urdf", INERTIA, INERTIA.replace("1.86e-3", "1e-1"), "masses",
         r"link 'hand' must have an inertia that a body can have, got principal moments .*, 0\.1"),

@@ -239,56 +239,20 @@ def _mimics(mujoco: Any, model: Any, joints: Sequence[str], notes: list[str]) ->
 
 
 def _efforts(mujoco: Any, model: Any, joints: Sequence[str]) -> dict[str, float]:
-    """Return the total effort of each joint's actuators at rest, within the joint's own limit."""
-    total: dict[int, Array] = {}
-    for a in range(len(model.actuator_trntype)):
-        force = _force(mujoco, model, a)
-        for joint, arm in _arms(mujoco, model, a):
-            total[joint] = total.get(joint, np.zeros(2)) + np.sort(arm * force)
+    """Return the effort of each joint whose actuators, or which itself, have force ranges.
 
-    # The joint's own limit applies to the sum, and on its own if there is no actuator.
-    efforts = {}
-    for j in range(model.njnt):
-        span = total.get(j)
-        if model.jnt_actfrclimited[j]:
-            most = model.jnt_actfrcrange[j]
-            span = most if span is None else np.clip(span, *most)
-        if span is not None and np.isfinite(span).all():
-            efforts[joints[j]] = float(np.abs(span).max())
-    return efforts
-
-
-def _arms(mujoco: Any, model: Any, a: int) -> list[tuple[int, float]]:
-    """Return each joint that an actuator moves, with its effort per force of the actuator."""
-    kinds, kind = mujoco.mjtTrn, model.actuator_trntype[a]
-    target, gear = int(model.actuator_trnid[a, 0]), float(model.actuator_gear[a, 0])
-    if kind == kinds.mjTRN_JOINT or kind == kinds.mjTRN_JOINTINPARENT:
-        return [(target, gear)]
-    if kind != kinds.mjTRN_TENDON:
-        return []
-
-    # A tendon that is a sum of joints; the lever arms of a spatial tendon differ between postures.
-    first = model.tendon_adr[target]
-    wraps = slice(first, first + model.tendon_num[target])
-    rows = zip(model.wrap_type[wraps], model.wrap_objid[wraps], model.wrap_prm[wraps], strict=True)
-    return [(int(joint), gear * float(coefficient)) for wrap, joint, coefficient in rows
-            if wrap == mujoco.mjtWrap.mjWRAP_JOINT]  # fmt: skip
-
-
-def _force(mujoco: Any, model: Any, a: int) -> Array:
-    """Return the smallest and largest force (2,) of an actuator at rest; infinite if unknown."""
-    force, biases, dynamics = np.array([-np.inf, np.inf]), mujoco.mjtBias, mujoco.mjtDyn
-    gain, bias = model.actuator_gainprm[a], model.actuator_biasprm[a]
-    kind = model.actuator_biastype[a]
-    instant = dynamics.mjDYN_NONE, dynamics.mjDYN_FILTER, dynamics.mjDYN_FILTEREXACT
-    direct = int(model.actuator_dyntype[a]) in instant
-    fixed = model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
-
-    # A servo's force depends on its position, so only its force range limits it.
-    constant = kind == biases.mjBIAS_NONE or (kind == biases.mjBIAS_AFFINE and bias[1] == 0.0)
-    if direct and fixed and constant and model.actuator_ctrllimited[a]:
-        start = 0.0 if kind == biases.mjBIAS_NONE else bias[0]
-        force = np.sort(start + gain[0] * model.actuator_ctrlrange[a])
-    if model.actuator_forcelimited[a]:
-        force = np.clip(force, *model.actuator_forcerange[a])
-    return force
+    Forces that follow from gains and controls, or from tendons, differ between postures.
+    """
+    total: dict[int, float] = {}
+    for a in range(model.nu):
+        if model.actuator_trntype[a] in (
+            mujoco.mjtTrn.mjTRN_JOINT,
+            mujoco.mjtTrn.mjTRN_JOINTINPARENT,
+        ):
+            most = np.abs(model.actuator_forcerange[a]).max()
+            force = most if model.actuator_forcelimited[a] else np.inf
+            joint = int(model.actuator_trnid[a, 0])
+            total[joint] = total.get(joint, 0.0) + force * abs(model.actuator_gear[a, 0])
+    for j in np.flatnonzero(model.jnt_actfrclimited).tolist():
+        total[j] = min(total.get(j, np.inf), float(np.abs(model.jnt_actfrcrange[j]).max()))
+    return {joints[j]: float(effort) for j, effort in total.items() if np.isfinite(effort)}
