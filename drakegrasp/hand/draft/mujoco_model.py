@@ -244,15 +244,13 @@ def _efforts(mujoco: Any, model: Any, joints: Sequence[str]) -> dict[str, float]
     Forces that follow from gains and controls, or from tendons, differ between postures.
     """
     total: dict[int, float] = {}
+    kinds = mujoco.mjtTrn
     for a in range(model.nu):
-        if model.actuator_trntype[a] in (
-            mujoco.mjtTrn.mjTRN_JOINT,
-            mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-        ):
-            most = np.abs(model.actuator_forcerange[a]).max()
+        if kinds(int(model.actuator_trntype[a])) in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
+            most = float(np.abs(model.actuator_forcerange[a]).max())
             force = most if model.actuator_forcelimited[a] else np.inf
             joint = int(model.actuator_trnid[a, 0])
-            total[joint] = total.get(joint, 0.0) + force * abs(model.actuator_gear[a, 0])
+            total[joint] = total.get(joint, 0.0) + force * abs(float(model.actuator_gear[a, 0]))
     for j in np.flatnonzero(model.jnt_actfrclimited).tolist():
         total[j] = min(total.get(j, np.inf), float(np.abs(model.jnt_actfrcrange[j]).max()))
     return {joints[j]: float(effort) for j, effort in total.items() if np.isfinite(effort)}
