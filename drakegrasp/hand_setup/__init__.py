@@ -1,1 +1,1 @@
-"""Checks of a hand before it is used: files, motion, and grasps of simple objects."""
+"""Hand setup: drafts of hands, and checks before use: files, motion, grasps of simple objects."""
