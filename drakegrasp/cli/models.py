@@ -16,7 +16,7 @@ from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, descri
 from drakegrasp.errors import counted
 
 if TYPE_CHECKING:
-    from drakegrasp.commissioning.checks import Finding
+    from drakegrasp.hand.checks import Finding
 
 
 @click.command()
@@ -180,7 +180,6 @@ def new_hand(
     effort: Annotated[float | None, click.FloatRange(min=0.0, min_open=True)] = None,
     settings: tuple[str, ...] = (),
     packages: tuple[str, ...] = (),
-    roots: tuple[Path, ...] = (),
 ) -> None:
     """Draft a hand file from a model, and draw it.
 
@@ -199,12 +198,11 @@ def new_hand(
         --effort E: Largest effort of each motor at its joint [N m, or N].
         --set KEY=VALUE (settings): A key of the hand file, as in --set drive=torque.
         --package NAME=FOLDER (packages): Folder of package://NAME/.
-        --root FOLDER (roots): A folder outside the model's folder whose meshes the model may use.
     """
     import numpy as np
 
-    from drakegrasp.commissioning.draft.fingers import Answers
-    from drakegrasp.commissioning.draft.run import draft_hand
+    from drakegrasp.hand.draft.fingers import Answers
+    from drakegrasp.hand_setup.new import draft_hand
 
     # The user's answers.
     answers = Answers(
@@ -217,7 +215,7 @@ def new_hand(
         settings=settings,
     )
     folders = {name: Path(text) for name, text in _pairs("--package", packages)}
-    drafted = draft_hand(model, out, answers=answers, packages=folders, roots=roots)
+    drafted = draft_hand(model, out, answers=answers, packages=folders)
 
     # The drafted hand.
     for note in drafted.notes:
@@ -270,7 +268,7 @@ def check_hand_file(hand_file: str, picture: Annotated[Path | None, NEW_FILE] = 
     Options:
         --picture PNG: Write a picture of the hand, open and closed, with pads and palm frame.
     """
-    from drakegrasp.commissioning.trial_grasps import check_hand
+    from drakegrasp.hand_setup.check import check_hand
 
     findings = check_hand(hand_file, report=_print)
 

@@ -58,6 +58,9 @@ from drakegrasp.hand.shapes import pad_surfaces
 #: Sliding distance that is treated as equal to a turn of one radian [m/rad], if one threshold
 #: serves closing joints of both kinds. It is about the length of a finger.
 SLIDE = 0.1
+#: Gain of the velocity-controlled fingers [N m s/rad]: a finger that is 0.1 rad/s too slow gets a
+#: torque of 2 N m. The gain of sliding fingers follows from `SLIDE`.
+FINGER_DAMPING = 20.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

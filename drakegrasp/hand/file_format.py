@@ -413,16 +413,25 @@ def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides:
     return replace(finger, torque_limit=limit, holding_torque=holding)
 
 
+def hand_keys(path: Path) -> Any:
+    """Return what the YAML of a hand file holds, whether its keys are valid or not.
+
+    Raises:
+        HandError: If the file cannot be read, or is not YAML.
+    """
+    try:
+        return parse_yaml_once(read_text(path))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
+
+
 def read_hand_file(path: Path) -> HandFile:
     """Return the contents of a hand file.
 
     Raises:
         HandError: If a key or a value is invalid; the message has one line.
     """
-    try:
-        tree: Any = parse_yaml_once(read_text(path))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
+    tree = hand_keys(path)
 
     # Another version may have other keys, so report only the version as the mistake.
     version = tree.get("version", VERSION) if isinstance(tree, dict) else VERSION

@@ -26,9 +26,9 @@ import yaml
 
 from drakegrasp.config import CarriedHand, Config, HandSource
 from drakegrasp.errors import DataError, HandError
+from drakegrasp.hand.file_format import hand_keys
 from drakegrasp.hand.files import (
     MODEL_SUFFIXES,
-    MODELS,
     PACKAGE,
     file_of,
     find_packages,
@@ -38,17 +38,13 @@ from drakegrasp.hand.files import (
     rewritten,
 )
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
-from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
+from drakegrasp.yaml_text import parse_yaml
 
 #: Maximum total size [byte], YAML size [byte] and number of a hand's files; a stranger may have
 #: written them.
 LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
-#: Names of licence files next to a hand file or its model; files whose lines may mention a licence.
+#: Names of licence files next to a hand file or its model.
 _LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
-_README = re.compile(r"(README(\..*)?|package\.xml)", re.IGNORECASE)
-_MENTION = re.compile(r"licen[cs]e|copyright", re.IGNORECASE)
-#: File of the lines that mention a licence.
-MENTIONS = "LICENSE-mentioned.txt"
 #: The keys of a hand file that name other files.
 _MODEL_LINE = re.compile(r"^model:.*$", re.MULTILINE)
 _PACKAGES_LINES = re.compile(r"^packages:.*\n(?:[ \t]+\S.*\n)*", re.MULTILINE)
@@ -104,7 +100,7 @@ class HandFolder:
 
     Attributes:
         within: Folder that no file may leave, for a dataset's hand; None for another hand.
-        texts: Bytes of hand file, models and lines about licences, keyed by place.
+        texts: Bytes of hand file and models, keyed by place.
         files: Current paths of all other files, keyed by place.
         counted: Places of the files in the digest, in their order; some of the files may be
             missing.
@@ -236,8 +232,8 @@ class HandFolder:
         self.texts[place] = rewritten(path.read_bytes(), add_named)
 
     def add_licences(self, folders: list[Path], hand: str) -> tuple[str, ...]:
-        """Add the licences in some folders and lines that mention them; return their places."""
-        places, lines = list[str](), list[str]()
+        """Add the licences in some folders; return their places."""
+        places = list[str]()
         for folder in folders:
             for path in sorted(folder.iterdir()) if folder.is_dir() else ():
                 # In a folder with several hands, the name of a licence may begin with the hand's
@@ -247,11 +243,6 @@ class HandFolder:
                     place = name if name not in self.files else f"{name}-{len(places)}"
                     self.add(place, path)
                     places += [place] if place in self.files else []
-                elif _README.fullmatch(name) and self.within is None and folder != MODELS:
-                    lines += _mentions(path) if self.has(path) else []
-        if lines:
-            self.texts[MENTIONS] = "\n".join([*dict.fromkeys(lines), ""]).encode()
-            places.append(MENTIONS)
         return tuple(places)
 
 
@@ -262,17 +253,11 @@ def _elsewhere(path: Path, there: bool) -> str:
     return f"files/{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}/{path.name}"
 
 
-def _mentions(path: Path) -> list[str]:
-    """Return the lines of a file that mention a licence."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    return [f"{path.name}: {line.strip()}" for line in lines if _MENTION.search(line)]
-
-
 def _described(path: Path) -> Mapping[str, Any]:
     """Return the keys of a hand file; empty if the file is not a YAML mapping."""
     try:
-        tree = parse_yaml_once(path.read_bytes())
-    except (yaml.YAMLError, UnicodeDecodeError):
+        tree = hand_keys(path)
+    except HandError:
         return {}
     return tree if isinstance(tree, dict) else {}
 

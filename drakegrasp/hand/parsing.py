@@ -17,6 +17,7 @@ joint turns, a length [m] if it slides.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -144,6 +145,10 @@ _MOMENTS = [
 ]
 
 
+#: A number as models write it.
+_NUMBER = re.compile(r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|inf(inity)?)", re.I)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Mimic:
     """A joint that follows another one: its position is ratio * leader + offset [rad or m]."""
@@ -264,10 +269,10 @@ def _value(tag: Element, name: str, default: str) -> str:
 
 
 def _number(text: str, what: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise HandError(f"model: {what} must be a number, got {text!r}") from None
+    """Return a number of a model, of which Drake would read only the beginning, or nothing."""
+    if not _NUMBER.fullmatch(text.strip()):
+        raise HandError(f"model: {what} must be a number, got {text!r}")
+    return float(text)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

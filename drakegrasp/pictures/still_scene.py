@@ -1,7 +1,7 @@
 """A still scene: a hand, by itself or with an object on a table, posed and drawn.
 
-Input: a hand, an object's model if there is one, and `Poses`. Output: poses of the links, overlaps
-of links, and pictures with their cameras, so that frames and contacts can be drawn over them.
+Input: a hand, an object's model if there is one, and `Poses`. Output: poses of the links,
+and pictures with their cameras, so that frames and contacts can be drawn over them.
 Nothing is simulated.
 
 For the 3D view of a browser, links and objects are JSON: a list of parts, each with its `colour`
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -200,14 +200,6 @@ class StillScene:
         shapes = self._plant.GetVisualGeometriesForBody(body)
         shapes = shapes or self._plant.GetCollisionGeometriesForBody(body)
         return self._graph.model_inspector(), list(shapes)
-
-    def overlaps(self) -> Iterator[tuple[tuple[str, str], float]]:
-        """Yield the names of two links whose collision shapes overlap, and their overlap [m]."""
-        query = self._query()
-        for pair in query.ComputePointPairPenetration():
-            frames = (query.inspector().GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
-            one, other = (self._plant.GetBodyFromFrameId(frame).name() for frame in frames)
-            yield (one, other), pair.depth
 
     def picture(self, X_WC: Array, size: tuple[int, int], lighting: Lighting = SHADOWS) -> Picture:
         """Return the picture of a camera.

@@ -65,7 +65,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import FINGER_DAMPING, Hand
 from drakegrasp.hand.file_format import Finger, with_efforts
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.kinematics import within_load
@@ -82,9 +82,6 @@ from drakegrasp.vision.camera import object_colour
 WRIST_BODY_MASS = 0.02
 #: Wrist gains [N/m], [N s/m]: under 2 kg the wrist sags by 0.02 mm.
 WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
-#: Gain of the velocity-controlled fingers [N m s/rad]: a finger that is 0.1 rad/s too slow gets a
-#: torque of 2 N m. The gain of sliding fingers follows from `description.SLIDE`.
-FINGER_DAMPING = 20.0
 #: Drake requires a positive stiffness [N m/rad]; this one adds less than a millionth of the torque.
 FINGER_STIFFNESS = 1e-6
 #: A separate motor that is this far from its path [rad, or 0.1 m] applies its full torque, and its

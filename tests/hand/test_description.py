@@ -28,10 +28,10 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Coupling
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.folder import hand_digest
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
+from drakegrasp.hand.overlaps import overlap_query
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.pictures.still_scene import Poses, StillScene
 
 #: Mass [kg] and bounding box of the CAD mesh [m] of each kind of link.
 LINKS = {
@@ -168,18 +168,17 @@ def built_scene(hand: Hand) -> tuple[MultibodyPlant, SceneGraph]:
 
 @pytest.mark.parametrize("spread_deg", [0.0, 11.25, 22.5, 90.0])
 def test_open_fingers_do_not_touch_each_other(hand: Hand, spread_deg: float) -> None:
-    scene = StillScene(hand)
-    scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(np.deg2rad(spread_deg))))
-    assert meeting_fingers(scene) == set()
+    overlaps = overlap_query(hand.model, hand.palm_link)
+
+    def meeting(spread: float, closing: list[float]) -> set[frozenset[str]]:
+        """Return the pairs of fingers of which two links overlap."""
+        met = overlaps(joint_positions(hand, spread, closing))
+        pairs = {frozenset(link.partition("_")[0] for link in links) for links, _ in met}
+        return {pair for pair in pairs if len(pair) == 2 and "base" not in pair}
+
+    assert meeting(np.deg2rad(spread_deg), [0.0, 0.0, 0.0]) == set()
     # Those that are closed do, at a spread.
-    scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(np.pi / 2.0, [2.4, 2.4, 2.4])))
-    assert len(meeting_fingers(scene)) == 3
-
-
-def meeting_fingers(scene: StillScene) -> set[frozenset[str]]:
-    """Return the pairs of fingers of which two links overlap."""
-    pairs = {frozenset(link.partition("_")[0] for link in links) for links, _ in scene.overlaps()}
-    return {pair for pair in pairs if len(pair) == 2 and "base" not in pair}
+    assert len(meeting(np.pi / 2.0, [2.4, 2.4, 2.4])) == 3
 
 
 def test_a_hand_of_two_fingers_without_spread_loads(tmp_path: Path) -> None:

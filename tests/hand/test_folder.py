@@ -105,13 +105,11 @@ def test_materials_textures_and_licences_come_along(tmp_path: Path) -> None:
     (meshes / "palm.mtl").write_text("newmtl a\nmap_Kd -s 1 1 1 skin.png\n")
     (meshes / "skin.png").write_bytes(b"a picture")
     (path.parent / "LICENSE.txt").write_text("\nMIT License\n")
-    (meshes.parent / "urdf" / "README.md").write_text("# Kit\n\nLicence: Apache-2.0\nand more\n")
     folder = carried_source(tmp_path / "out", load_config(hand=str(path))).path.parent
     (copied,) = folder.glob("files/*/palm.obj")
     assert copied.read_bytes() == mesh.read_bytes()
     assert (copied.parent / "skin.png").read_bytes() == b"a picture"
     assert (folder / "LICENSE.txt").read_text() == "\nMIT License\n"
-    assert (folder / "LICENSE-mentioned.txt").read_text() == "README.md: Licence: Apache-2.0\n"
 
 
 def change(path: Path, before: str, after: str) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from helpers.hands import SLIDER, slider_fingers, write_slider
 
-from drakegrasp.commissioning.checks import check_couplings
 from drakegrasp.errors import HandError
+from drakegrasp.hand.checks import check_couplings
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import (
     closed_positions,

@@ -1,1 +1,0 @@
-"""Checks of a hand before it is used: files, motion, and grasps of simple objects."""

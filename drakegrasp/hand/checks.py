@@ -1,0 +1,468 @@
+"""Checks of a hand's files and geometry; nothing is simulated.
+
+Input: a loaded hand. Output: a `Finding` per check: masses, limits, couplings and efforts of its
+files; palm, finger order, pads, and links that collide when the hand closes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from pydrake.multibody.plant import MultibodyPlant
+from scipy.linalg import block_diag
+
+from drakegrasp.config import Config
+from drakegrasp.frames import Array, transform_points
+from drakegrasp.hand.description import FINGER_DAMPING, Hand
+from drakegrasp.hand.file_format import Finger
+from drakegrasp.hand.finger_sweep import (
+    Opposition,
+    closing_path,
+    find_opposition,
+    find_pinch,
+    pad_fronts,
+    pad_points_at,
+    reach,
+)
+from drakegrasp.hand.kinematics import (
+    closed_positions,
+    coordinate_limits,
+    fingertip_forces,
+    fingertip_poses,
+    joint_positions,
+    link_poses,
+    still_links,
+)
+from drakegrasp.hand.overlaps import overlap_query
+from drakegrasp.hand.parsing import (
+    Mimic,
+    add_model,
+    declared_masses,
+    declared_mimics,
+    impossible_inertias,
+    read_xml,
+)
+from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces, ray_span
+
+#: Smallest range of a closing joint, in its unit; a smaller range does not close a hand.
+LEAST_RANGE = np.deg2rad(5.0)
+#: Largest difference of a coupling from the model's own.
+SAME = 1e-3
+#: The origin of {G} may be this deep in the hand [m]; in the Barrett Hand it is 1.35 mm deep.
+PALM_DEPTH = 0.005
+#: Length of the palm ray that must be free [m].
+RAY = 0.3
+#: Pads that come this close to each other meet [m].
+MEETING = 0.008
+#: Largest reach of the hand beyond its pinch along +Gz [m]; with more, the palm cannot face a
+#: table.
+BEYOND_PINCH = 0.1
+#: Number of postures from the open to the closed hand.
+POSTURES = 40
+#: Links of different fingers may overlap by this before their fingertips meet [m].
+OVERLAP = 0.002
+#: Width of an object that every hand must be able to hold [m].
+WIDTH = 0.02
+#: Largest distance of a pad point from the surface of its fingertip [m].
+ON_SURFACE = 0.003
+#: Places are the same within this [m].
+SAME_PLACE = 1e-7
+#: Required room behind a pad's face [m], and the cosine above which a border is parallel to it.
+LEEWAY, FACING = 0.003, 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One check of a hand.
+
+    Attributes:
+        name: What was checked.
+        ok: Whether the check passed.
+        text: What was found; for a fault, its place and the requirement.
+    """
+
+    name: str
+    ok: bool
+    text: str
+
+
+def judge(name: str, faults: Sequence[str], fine: str) -> Finding:
+    """Return the finding of a check: its faults, or the text `fine` if there are none."""
+    return Finding(name=name, ok=not faults, text="; ".join(faults) or fine)
+
+
+def check_masses(hand: Hand) -> Finding:
+    """Return whether every link has a mass and a physically possible inertia."""
+    # Drake parses the inertias; the masses are read from the text of the file.
+    root = read_xml(hand.model.path)
+    masses, impossible = declared_masses(root), impossible_inertias(root)
+    plant, faults = MultibodyPlant(0.0), []
+    for index in plant.GetBodyIndices(add_model(plant, hand.model)):
+        body = plant.get_body(index)
+        name, mass = body.name(), masses.get(body.name(), 0.0)
+        if not mass > 0.0:
+            faults.append(f"link {name!r} must have a mass above 0 kg, got {mass:g}")
+        elif name in impossible or not body.default_spatial_inertia().IsPhysicallyValid():
+            got = f", got {impossible[name]}" if name in impossible else ""
+            faults.append(f"link {name!r} must have an inertia that a body can have{got}")
+    return judge("masses", faults, f"{len(masses)} links, {sum(masses.values()):.3g} kg in all")
+
+
+def check_limits(hand: Hand) -> Finding:
+    """Return whether each closing joint has limits between which it can close, from zero."""
+    # Check the closing joints' own limits, then the range that their coupled joints leave.
+    faults, ranges = [], []
+    of_joint = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
+    for finger, (lower, upper), unit in zip(
+        hand.fingers, coordinate_limits(hand)[1:], hand.closing_unit.tolist(), strict=True
+    ):
+        own, joint = of_joint[finger.closing_joint], f"joint {finger.closing_joint!r}"
+        left, got = f"{lower:.3g}..{upper:.3g}", f"got {own[0]:.3g}..{own[1]:.3g}"
+        if not np.isfinite(own).all():
+            faults.append(f"{joint} must have limits, {got}")
+        elif not (own[0] <= 0.0 and own[1] >= LEAST_RANGE * unit):
+            faults.append(f"{joint} must reach from 0, the open hand, to a positive limit, {got}")
+        elif lower > SAME * unit or upper < LEAST_RANGE * unit:
+            rules = ", ".join(f"{c.joint} by {c.ratio:g} and {c.offset:g}" for c in finger.coupled)
+            faults.append(
+                f"finger {finger.name!r} must be open at 0 and able to close, but limits of its "
+                f"coupled joints ({rules}) leave {left}: check signs of ratios, and offsets"
+            )
+        shown = f"{1e3 * upper:.0f} mm" if finger.slides else f"{np.rad2deg(upper):.0f}°"
+        ranges.append(f"{finger.name} {shown}")
+
+    # Check the spreads.
+    least, most = np.rad2deg(coordinate_limits(hand)[0])
+    for spread in hand.spreads_deg:
+        if not least - 1e-6 <= spread <= most + 1e-6:
+            faults.append(f"spreads_deg must be {least:g}..{most:g}, got {spread:g}")
+    return judge("limits", faults, f"closing up to {', '.join(ranges)}")
+
+
+def check_couplings(hand: Hand) -> Finding:
+    """Return whether the couplings agree with those of the model, if the model has any."""
+    closes, faults = {finger.closing_joint: finger.name for finger in hand.fingers}, []
+    for mimic in declared_mimics(read_xml(hand.model.path)):
+        if _moves_as(hand, mimic):
+            continue
+
+        # One motor may move two fingers in the model.
+        ratio, leader = mimic.ratio, mimic.leader
+        if {mimic.joint, leader} <= set(closes) and ratio > 0.0:
+            i = list(closes).index(mimic.joint)
+            faults.append(
+                f"fingers.{i}.driven_by must be {{finger: {closes[leader]}, ratio: {ratio:g}}} in "
+                "place of a motor of its own: in the model one moves both"
+            )
+        else:
+            faults.append(
+                f"joint {mimic.joint!r} must be coupled to {leader!r} by {ratio:g} and "
+                f"{mimic.offset:g}, as in the model"
+            )
+    own = [f"{c.joint} {c.ratio:+g}" for finger in hand.fingers for c in finger.coupled]
+    return judge("couplings", faults, ", ".join(own) or "none")
+
+
+def _moves_as(hand: Hand, mimic: Mimic) -> bool:
+    """Return whether two joints of a hand move according to a coupling of its model."""
+    if not {mimic.joint, mimic.leader} <= set(hand.joint_names):
+        return False
+
+    # Positions are linear in the coordinates: those of the spread, of a motor, or none.
+    j, i = (hand.joint_names.index(name) for name in (mimic.joint, mimic.leader))
+    gains = hand.joint_gain @ block_diag(1.0, hand.closing_ratio)
+    gain = gains[j] - mimic.ratio * gains[i]
+    offset = hand.joint_offset[j] - mimic.ratio * hand.joint_offset[i] - mimic.offset
+    return bool(np.abs(gain).max() <= SAME and abs(offset) <= SAME)
+
+
+def check_efforts(hand: Hand, config: Config) -> Finding:
+    """Return whether motors reach their efforts and close the hand in time, and what it presses."""
+    # A motor is a gain on the speed error: a stalled motor gives gain * speed, up to its limit.
+    faults = []
+    limits, units = coordinate_limits(hand)[1:, 1], hand.closing_unit
+    for finger, speed, limit, unit in zip(
+        hand.fingers, hand.closing_speed, limits, units, strict=True
+    ):
+        stalled = FINGER_DAMPING * speed / unit**2
+        if finger.driven_by is None and stalled < finger.effort_limit:
+            faults.append(
+                f"finger {finger.name!r} must close fast enough for its motor: at its speed a "
+                f"stalled one gives {stalled:.3g} of {finger.effort_limit:g} {finger.effort_unit}"
+            )
+        if np.isfinite(limit) and limit / speed > config.close.max_time:
+            faults.append(
+                f"finger {finger.name!r} must close within close.max_time, "
+                f"{config.close.max_time:g} s, got {limit / speed:.2g} s"
+            )
+
+    # Compute the fingertip forces, and whether friction then supports the payload.
+    forces = fingertip_forces(hand, "torque")
+    carried = config.physics.friction_hand * float(forces.sum()) / 9.81
+    if hand.payload is not None and carried < hand.payload:
+        # Round down to grams, because the reported payload must pass the check.
+        most = np.floor(1e3 * carried) / 1e3
+        faults.append(
+            f"payload must be at most {most:g} kg, which friction carries, got {hand.payload:g} kg"
+        )
+    listed = ", ".join(f"{f:.3g}" for f in forces)
+    carries = f"friction carries {carried:.2g} kg"
+    return judge("efforts", faults, f"{config.lift.drive or hand.drive}; {listed} N; {carries}")
+
+
+def check_geometry(hand: Hand) -> Iterator[Finding]:
+    """Yield findings on a hand's geometry; nothing is simulated."""
+    # The palm comes first: seen from behind, the order of the fingers is reversed.
+    palm = check_palm(hand)
+    yield palm
+    if not palm.ok:
+        return
+    yield check_order(hand)
+    pads = check_pads(hand)
+    yield pads
+    if pads.ok:
+        yield check_meeting(hand)
+    yield check_overlaps(hand)
+
+
+def check_palm(hand: Hand) -> Finding:
+    """Return whether +Gz leaves the hand at the palm, towards where the fingertips close."""
+    # Compute how far the ray from the origin of {G} along +Gz is inside the open hand.
+    opened, shapes, faults = np.zeros(hand.num_fingers), link_shapes(hand.model), []
+    depths = [(0.0, "")]
+    for link in hand.link_chains:
+        X_GL = link_poses(hand, link, spread=0.0, closing=opened)
+        depths += [(ray_end(transform_points(X_GL, corners)), link) for corners in shapes[link]]
+    worst, blocked = max(depths, key=lambda pair: pair[0])
+    if not any(len(shapes[link]) for link in still_links(hand)):
+        faults.append(
+            f"link {hand.palm_link!r}, or one that is fixed to it, must have a collision shape, "
+            "got none"
+        )
+    if worst > PALM_DEPTH:
+        faults.append(
+            f"the palm ray along +Gz must be free, got link {blocked!r} up to "
+            f"{1e3 * worst:.0f} mm from the origin of {{G}}: check palm.p_BG and palm.rpy_deg"
+        )
+
+    # Check that the fingertips close in front of the palm.
+    height = float(pad_points_at(hand, 0.5 * closed_positions(hand))[:, 2].mean())
+    if height <= 0.0:
+        faults.append(
+            f"+Gz must point to where the fingertips close, got them {-1e3 * height:.0f} mm behind "
+            "the palm: check palm.rpy_deg"
+        )
+    text = f"the ray along +Gz is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
+    pinch = None if faults else find_pinch(hand, WIDTH)
+    if pinch is not None:
+        # Links beyond the pinch would meet the table before the fingertips meet the object.
+        beyond = reach(hand, np.array([0.0, 0.0, 1.0])) - float(pinch.p_GM[2])
+        text += f"; the hand reaches {1e3 * beyond:.0f} mm beyond the pinch"
+        if beyond > BEYOND_PINCH:
+            faults.append(
+                "the palm must be able to face a table, but the hand reaches "
+                f"{1e3 * beyond:.0f} mm beyond the pinch along +Gz: turn "
+                "palm.rpy_deg, or keep fingers that do not grasp away with preshape"
+            )
+    return judge("palm", faults, text)
+
+
+def ray_end(corners: Array) -> float:
+    """Return the distance [m] at which the ray along +Gz leaves a convex hull; 0 if it misses.
+
+    Args:
+        corners: (n, 3), points in {G} that span the convex hull [m].
+    """
+    span = ray_span(corners, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    return 0.0 if span is None or span[0] > RAY else max(span[1], 0.0)
+
+
+def check_order(hand: Hand) -> Finding:
+    """Return whether the fingers are in their order around +Gz.
+
+    Seen from the object, which faces the palm, the order must be counter-clockwise. For two
+    fingers, every order is correct.
+    """
+    # Angles of the pad points about Gz, measured from the first finger, must increase.
+    points = pad_points_at(hand, np.zeros(hand.num_fingers))[:, :2]
+    centred = points - points.mean(axis=0)
+    angles = np.arctan2(centred[:, 1], centred[:, 0])
+    order = np.argsort(np.mod(angles - angles[0], 2.0 * np.pi), kind="stable")
+    right = ", ".join(hand.fingers[i].name for i in order)
+    got = ", ".join(finger.name for finger in hand.fingers)
+    fault = f"fingers must run counter-clockwise about +Gz ({right}), got {got}"
+    return judge("finger order", [fault] if right != got else [], got)
+
+
+def check_pads(hand: Hand) -> Finding:
+    """Return whether each pad is on its fingertip's surface and faces where the finger closes."""
+    # Check the distance of the pad points from the surface.
+    shapes, faults, areas = link_shapes(hand.model), [], []
+    facing = _facing(hand)
+    for i, (finger, pad) in enumerate(
+        zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True)
+    ):
+        parts = [hull_triangles(corners) for corners in shapes[finger.fingertip]]
+        if not parts:
+            faults.append(f"link {finger.fingertip!r} must have a collision shape, got none")
+            continue
+        triangles = np.concatenate(parts)
+        points = np.tile(finger.p_FiP, (len(triangles), 1))
+        near = trimesh.triangles.closest_point(triangles, points)
+        distance = float(np.linalg.norm(near - points, axis=1).min())
+        if distance > ON_SURFACE:
+            faults.append(
+                f"fingers.{i}.pad_point must lie on the surface of link {finger.fingertip!r}, "
+                f"got one {1e3 * distance:.1f} mm away"
+            )
+        if not len(pad):
+            faults.append(f"fingers.{i}.pad_region must hold a part of the surface, got none of it")
+            continue
+
+        # The pad must face the direction of its motion, and have room behind its face.
+        if facing[i] <= 0.0:
+            faults.append(
+                f"the pad of finger {finger.name!r} must face where the finger closes, got its "
+                f"back: {_turned_round(hand, i)}"
+            )
+        faults += _tight_borders(i, finger, pad)
+        areas.append(1e6 * float(trimesh.triangles.area(pad).sum()))
+    return judge("pads", faults, f"{', '.join(f'{area:.0f}' for area in areas)} mm²")
+
+
+def _turned_round(hand: Hand, i: int) -> str:
+    """Return how to repair a finger that moves away from its pad's side."""
+    # A joint that opens the hand moves the pad away from those of the other fingers.
+    start = pad_points_at(hand, np.zeros(hand.num_fingers))
+    moved = pad_points_at(hand, 0.1 * closed_positions(hand))
+    others = np.delete(start, i, axis=0).mean(axis=0)
+    if np.linalg.norm(moved[i] - others) <= np.linalg.norm(start[i] - others):
+        return "check the pad_region, and the axis of the closing joint"
+    return (
+        f"a positive position of joint {hand.fingers[i].closing_joint!r} opens the hand: make it "
+        "close from 0 in the open hand, or take `drakegrasp hand new`"
+    )
+
+
+def _tight_borders(i: int, finger: Finger, pad: Array) -> Iterator[str]:
+    """Yield the borders of a pad region that lie on the pad's face, and how to repair them.
+
+    A pressed object sinks in by a millimetre or two; contact behind the border is not on the pad.
+    """
+    areas, normals = trimesh.triangles.area(pad), _normals(pad)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for n, (*direction, offset) in enumerate(finger.pad_region):
+        length = float(np.linalg.norm(direction))
+        along = np.array(direction) / length
+        depth = pad.mean(axis=1) @ along - offset / length
+        on_face = (np.abs(normals @ along) > FACING) & (depth < LEEWAY / 2.0)
+        if areas[on_face].sum() > 0.5 * areas.sum():
+            mended = [round(float(x), 5) for x in (*direction, offset - LEEWAY * length)]
+            yield (
+                f"fingers.{i}.pad_region.{n} must leave room behind the pad's face, into which "
+                f"objects sink, got none: {1e3 * LEEWAY:.0f} mm are in {mended}"
+            )
+
+
+def _normals(triangles: Array) -> Array:
+    """Return the normals (n, 3) of triangles (n, 3, 3), as long as twice their areas."""
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
+def _face_at(triangles: Array, point: Array) -> Array:
+    """Return the triangles among (n, 3, 3) that are closest to a point (3,) [m]."""
+    near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
+    distance = np.linalg.norm(near - point, axis=1)
+    return np.asarray(triangles[distance <= distance.min() + SAME_PLACE])
+
+
+def _facing(hand: Hand) -> Array:
+    """Return the cosine (k,) between each pad's normal and its motion, when half closed."""
+    # Motion of the pad points as the fingers close.
+    half, step = 0.5 * closed_positions(hand), 1e-4 * hand.closing_unit
+    motion = pad_points_at(hand, half + step) - pad_points_at(hand, half)
+
+    # Mean normal of each pad's surface, out of the fingertip. Without a region the pad is the whole
+    # closed surface, whose mean normal is zero, so that only the triangles at the pad point count.
+    X_GF, shapes = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand.model)
+    cosines = np.zeros(hand.num_fingers)
+    for i, pad in enumerate(pad_surfaces(hand.model, hand.fingers)):
+        corners = shapes[hand.fingers[i].fingertip]
+        if not len(pad) or not corners:
+            continue
+        if not hand.fingers[i].pad_region:
+            pad = _face_at(pad, hand.fingers[i].p_FiP)
+        normals, centre = _normals(pad), np.concatenate(corners).mean(axis=0)
+        inward = np.einsum("ij,ij->i", normals, pad.mean(axis=1) - centre) < 0.0
+        normals[inward] *= -1.0
+        normal = X_GF[i, :3, :3] @ normals.sum(axis=0)
+        length = np.linalg.norm(normal) * np.linalg.norm(motion[i])
+        cosines[i] = normal @ motion[i] / length if length > 0.0 else 0.0
+    return cosines
+
+
+def check_meeting(hand: Hand) -> Finding:
+    """Return whether the pads of opposed fingers meet when the hand closes."""
+    opposition = _, group = find_opposition(hand)
+    first, second = (
+        [f.name for f, is_first in zip(hand.fingers, group, strict=True)
+         if is_first == own] for own in (True, False)
+    )  # fmt: skip
+    if not first or not second:
+        fault = "fingers must close against each other, got all of them in one direction: check "
+        return judge("fingertips", [fault + "the axes of the closing joints"], "")
+
+    # Each pad must reach those opposite, and an object must fit between them.
+    text, short = (
+        f"{' and '.join(first)} against {' and '.join(second)}",
+        _shortfall(hand, opposition),
+    )
+    missing = {f.name: 1e3 * s for f, s in zip(hand.fingers, short, strict=True) if s > MEETING}
+    if not missing and find_pinch(hand, WIDTH) is not None:
+        return judge("fingertips", [], f"{text} meet")
+    got = ", ".join(f"that of {name} {gap:.0f} mm short" for name, gap in missing.items())
+    fault = f"pads of {text} must meet when they close, got {got or 'no posture that pinches'}"
+    if any(finger.coupled for finger in hand.fingers if finger.name in missing):
+        fault += "; check the signs of the ratios of coupled joints"
+    return judge("fingertips", [fault], "")
+
+
+def _shortfall(hand: Hand, opposition: Opposition) -> Array:
+    """Return the gap (k,) between each pad and the pads opposite, along their line [m]."""
+    (axis, group), (_, front) = opposition, pad_fronts(hand, opposition)
+    reached = (front @ axis * np.where(group, 1.0, -1.0)).max(axis=0)
+    opposite = [-reached[group != own].max() for own in group]
+    return np.asarray(opposite - reached)
+
+
+def check_overlaps(hand: Hand) -> Finding:
+    """Return whether only fingertips of different fingers meet until the hand is closed.
+
+    In the simulation, other links pass through each other, so they must not touch.
+    """
+    # Find the finger whose closing moves each link: 1 for the first finger, 0 for no finger.
+    overlaps, faults = overlap_query(hand.model, hand.palm_link), dict[str, float]()
+    moves = {link: chain.gain[:, 1:].any(axis=0) for link, chain in hand.link_chains.items()}
+    movers = {link: 1 + int(by.argmax()) if by.any() else 0 for link, by in moves.items()}
+
+    # Close the hand step by step, until two fingertips meet.
+    for closing in closing_path(hand, POSTURES):
+        met = False
+        for links, depth in overlaps(joint_positions(hand, 0.0, closing)):
+            # A link above the palm is not in the palm's tree, and fingers do not move it.
+            one, other = (movers.get(link, 0) for link in links)
+            if not one or not other or one == other:
+                continue
+            if set(links) <= set(hand.fingertip_links):
+                met = True
+            elif depth > OVERLAP:
+                key = f"links {links[0]!r} and {links[1]!r}"
+                faults[key] = max(faults.get(key, 0.0), depth)
+        if met:
+            break
+    texts = [f"{key} must not meet before fingertips do, got {1e3 * depth:.1f} mm of overlap"
+             for key, depth in faults.items()]  # fmt: skip
+    return judge("self-collision", texts, "fingertips meet before any other links")

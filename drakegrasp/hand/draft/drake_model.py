@@ -1,0 +1,224 @@
+"""URDF and SDFormat as Drake parses them.
+
+Input: the path of a model. Output: its bodies and joints. Drake reads few formats of meshes, so it
+gets Wavefront files in their place. Drake keeps no efforts, mimics and missing masses, and reads
+some words as numbers: `hand.parsing` has what the text declares.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from pydrake.geometry import Role, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import SpatialInertia
+
+from drakegrasp.errors import HandError, first_line, one_line
+from drakegrasp.foreign_files import read_content
+from drakegrasp.hand.draft.shapes import Shape, read_mesh, read_shape
+from drakegrasp.hand.draft.vendor import Link, VendorJoint, VendorModel
+from drakegrasp.hand.files import rewritten
+from drakegrasp.hand.parsing import (
+    declared_efforts,
+    declared_masses,
+    declared_mimics,
+    impossible_inertias,
+    joint_axis,
+    joint_slides,
+    make_parser,
+    moving_joint,
+    refuse_impossible,
+    refuse_other_joint,
+)
+from drakegrasp.mesh.wavefront import obj_text
+
+#: Maximum size of a model's text [bytes].
+LONGEST = 20_000_000
+#: What a model's text must not have, and what it must be.
+_REFUSED = (
+    (rb"<!DOCTYPE|<!ENTITY", "must be XML without a document type, got {}"),
+    (
+        rb"<xacro:\w+|\$[{(][^<>\"']*",
+        "must be a model without xacro, got {}: first convert the file with `xacro`",
+    ),
+    (
+        rb"<(?:drake:)?include\b|<submesh\b",
+        "must be complete by itself, got {}: put what it names into the file",
+    ),
+)
+#: Drake's warnings on parts that no hand has, or that are reported elsewhere.
+_ASIDE = re.compile("'(light|camera|sensor|transmission|gazebo)'|effort limits|inertia")
+
+
+def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
+    """Return the bodies and joints of a URDF or SDFormat model.
+
+    Args:
+        path: The model.
+        find: Returns the file of a mesh's URI, given the folder of the model.
+
+    Raises:
+        HandError: If Drake rejects the model, its numbers are impossible, or the mesh of a
+            collision shape cannot be read.
+    """
+    text, root = _text_of(path)
+    refuse_impossible(root)
+    masses, impossible = declared_masses(root), impossible_inertias(root)
+    for name, mass in masses.items():
+        if mass < 0.0:
+            raise HandError(f"model: link {name!r} must have a mass of 0 kg or more, got {mass:g}")
+    plant, graph, meshes = MultibodyPlant(1e-3), SceneGraph(), dict[str, Shape | HandError]()
+    plant.RegisterAsSourceForSceneGraph(graph)
+    with tempfile.TemporaryDirectory() as scratch:
+        copy = Path(scratch) / f"model{path.suffix.lower()}"
+
+        def convert(uri: str, is_geometry: bool) -> str:
+            return _convert(uri, path.parent, find, copy.parent, meshes) if is_geometry else uri
+
+        text = rewritten(text, convert)
+        copy.write_bytes(text)
+        instance, notes = _parse(plant, copy)
+
+    efforts = declared_efforts(root)
+    for motor in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
+        efforts.setdefault(motor.joint().name(), motor.effort_limit())
+
+    # Bodies and joints; a joint to the world only fixes the hand.
+    links = {}
+    for body in map(plant.get_body, plant.GetBodyIndices(instance)):
+        name, drawn = body.name(), plant.GetVisualGeometriesForBody(body)
+        solids = plant.GetCollisionGeometriesForBody(body)
+        shapes = {
+            kind: [read_shape(graph.model_inspector(), shape, role, meshes, notes) for shape in own]
+            for kind, role, own in (
+                ("collisions", Role.kProximity, solids),
+                ("visuals", Role.kIllustration, drawn),
+            )
+        }
+        links[name] = Link(
+            name=name,
+            # Drake replaces a mass of zero by its own value.
+            inertia=SpatialInertia.Zero()
+            if body.default_mass() == 0.0 or masses.get(name) == 0.0
+            else body.default_spatial_inertia(),
+            impossible=impossible.get(name, ""),
+            **{kind: tuple(s for s in own if s is not None) for kind, own in shapes.items()},
+        )
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    world = plant.world_body().index()
+    return VendorModel(
+        name=plant.GetModelInstanceName(instance),
+        links=links,
+        joints={
+            joint.name(): _joint(joint, efforts.get(joint.name(), 0.0))
+            for joint in joints
+            if joint.parent_body().index() != world
+        },
+        mimics={mimic.joint: mimic for mimic in declared_mimics(root)},
+        notes=tuple(dict.fromkeys(notes)),
+    )
+
+
+def _text_of(path: Path) -> tuple[bytes, Element]:
+    """Return the text of a model without its comments, and the root of its XML."""
+    try:
+        text = re.sub(rb"<!--.*?-->", b"", read_content(path, LONGEST), flags=re.DOTALL)
+    except OSError as error:
+        raise HandError(f"{path}: must be a readable file, got: {error.strerror}") from None
+    for pattern, must in _REFUSED:
+        if found := re.search(pattern, text):
+            raise HandError(f"{path}: {must.format(repr(found[0].decode(errors='replace')))}")
+    try:
+        return text, ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
+
+
+def _convert(
+    uri: str,
+    folder: Path,
+    find: Callable[[str, Path], Path],
+    scratch: Path,
+    meshes: dict[str, Shape | HandError],
+) -> str:
+    """Return the name of a Wavefront file that Drake reads in place of a mesh.
+
+    Args:
+        uri: The URI of the mesh.
+        folder: Folder of the model.
+        find: Returns the file of a URI.
+        scratch: Folder of the Wavefront files. Drake must find them; their triangles are not used.
+        meshes: Receives the content of the mesh, or why it cannot be read.
+    """
+    name = f"{hashlib.sha256(uri.encode(errors='surrogateescape')).hexdigest()[:16]}.obj"
+    if name not in meshes:
+        try:
+            meshes[name] = read_mesh(find(uri, folder))
+        except HandError as error:
+            meshes[name] = error
+        (scratch / name).write_text(_STAND_IN, encoding="utf-8")
+    return name
+
+
+#: A tetrahedron.
+_STAND_IN = obj_text(
+    np.vstack((np.zeros(3), 0.01 * np.eye(3))),
+    [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+    normals=False,
+)
+
+
+def _parse(plant: MultibodyPlant, path: Path) -> tuple[Any, list[str]]:
+    """Let Drake parse a model file; return its model instance, and notes of what it left out."""
+    parser, logger, messages = make_parser(plant), logging.getLogger("drake"), list[str]()
+
+    def hear(record: logging.LogRecord) -> bool:
+        if record.levelno == logging.WARNING:
+            messages.append(record.getMessage())
+        return record.levelno > logging.WARNING
+
+    logger.addFilter(hear)
+    try:
+        (instance,) = parser.AddModels(path)
+    except (RuntimeError, ValueError, SystemExit) as error:
+        text = first_line(error).replace(f"{path.parent}/", "")
+        raise HandError(f"model: must be a file of one model, got {text}") from None
+    finally:
+        logger.removeFilter(hear)
+    lines = (" ".join(m.split()).partition(" warning: ")[2] for m in messages)
+    return instance, [f"Drake: {t}" for t in dict.fromkeys(lines) if t and not _ASIDE.search(t)]
+
+
+def _joint(joint: Any, effort: float) -> VendorJoint:
+    """Return what a joint of Drake is."""
+    refuse_other_joint(joint)
+    X_PJ, X_CJ = (
+        np.asarray(frame.GetFixedPoseInBodyFrame().GetAsMatrix4())
+        for frame in (joint.frame_on_parent(), joint.frame_on_child())
+    )
+    ends = {"parent": joint.parent_body().name(), "child": joint.child_body().name()}
+
+    # A fixed joint may hold its child away from its frame.
+    if not moving_joint(joint):
+        X_PJ = X_PJ @ joint.X_FM().GetAsMatrix4()
+        return VendorJoint(name=joint.name(), **ends, X_PJ=X_PJ, X_CJ=X_CJ)
+    return VendorJoint(
+        name=joint.name(),
+        **ends,
+        X_PJ=X_PJ,
+        X_CJ=X_CJ,
+        axis=joint_axis(joint),
+        slides=joint_slides(joint),
+        limits=np.array([joint.position_lower_limit(), joint.position_upper_limit()]),
+        effort=effort if np.isfinite(effort) else 0.0,
+        velocity=float(joint.velocity_upper_limit()),
+    )

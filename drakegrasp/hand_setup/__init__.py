@@ -1,0 +1,1 @@
+"""Hand setup: drafts of hands, and checks before use: files, motion, grasps of simple objects."""

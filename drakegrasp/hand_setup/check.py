@@ -1,0 +1,277 @@
+"""`check_hand`: all checks of a hand, including trial grasps in which it lifts simple objects.
+
+Input: a hand. Output: for each object the best of a few attempts. Their palm poses follow from how
+the fingertips close (`find_pinch`). The attempts are those of a build: `run_attempt` simulates
+them. The object hangs in the air until it is held. So gravity can act along the line on which the
+fingers close, across it, or in between. A hand whose fingers do not resist along that line holds in
+only some of these cases.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import trimesh
+
+from drakegrasp.config import Config, ObjectConfig, with_whole_lifts
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.hand.checks import (
+    Finding,
+    check_couplings,
+    check_efforts,
+    check_geometry,
+    check_limits,
+    check_masses,
+    judge,
+)
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.file_format import Drive
+from drakegrasp.hand.finger_sweep import Pinch, find_opposition, find_pinch, reach
+from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.objects.model import ObjectModel, make_object
+from drakegrasp.outcomes import LOST, Outcome
+from drakegrasp.runtime.environment import one_thread
+from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.drive import drive_of
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+
+#: Widths of the trial objects [m].
+WIDTHS = (0.045, 0.06, 0.03)
+#: Largest mass of the objects [kg]; a smaller payload of the hand replaces it.
+MASS = 0.3
+#: Space between hand and table, between palm and object, and around the pads on the object [m].
+ABOVE_TABLE, BEFORE_PALM, AROUND_PADS = 0.1, 0.008, 0.012
+#: Smallest size of an object in any direction [m].
+LEAST_SIZE = 0.03
+#: Fingers farther from the centre than this fraction of a ball's width only meet its sides.
+WIDEST = 0.7
+#: Angle of the line on which the fingers close, above the horizontal [rad]. If the line is level,
+#: the palm faces the table.
+LINES = {"level": 0.0, "tilted": np.deg2rad(45.0), "upright": np.deg2rad(90.0)}
+#: Objects that the hand must grasp, and the lines on which it must grasp them.
+GRASPS = (
+    *(("box", line) for line in LINES),
+    ("cylinder", "level"),
+    ("sphere", "level"),
+)
+
+
+#: An object, its pose X_TO (4, 4) on the table, the start of the hand, and the width of the object
+#: between the fingers [m].
+TrialGrasp: TypeAlias = tuple[ObjectModel, Array, Attempt, float]
+#: Label of a grasp that holds, but moves more in the hand than a sample may.
+MOVED = "moved too far in the hand"
+#: What a drive does to the fingers, in words.
+_HOW = {"worm": "held by worms", "locked": "locked", "torque": "pushed open"}
+#: How to repair a hand that holds nothing along the line on which its fingers close.
+_SOFT = (
+    "two motors that push against each other do not hold along their line; say `drive: worm` if "
+    "its gears cannot be pushed open, or its fingers share a motor"
+)
+#: How to repair a hand that loses the object, and hands with other failures, by their labels.
+_LOST = "pads must face each other where they meet, and motors press enough (efforts)"
+_MENDS = {
+    Outcome.MISSING_FINGERTIP.label: "fingertips must touch it within the pad_region; let the "
+    "region reach 3 mm behind its face and to the end of the finger",
+    Outcome.HAND_CONTACT.label: "other links touch it first; open the hand wider, or move the palm "
+    "back (p_BG)",
+    Outcome.START_COLLISION.label: "the open hand is in its way; keep fingers that do not grasp "
+    "away with preshape",
+    **{o.label: _LOST for o in LOST},
+    MOVED: _LOST,
+}
+
+
+def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> Finding:
+    """Return whether the hand can grasp and lift an object, and how far the object slips.
+
+    Fingers that can be pushed open may lose an object that nothing centres between them. For such a
+    hand, the finding states whether it holds with locked fingers, and the result of the same grasp
+    without locking.
+
+    Args:
+        hand: The hand.
+        config: The rules.
+        shape: "box", "cylinder" or "sphere".
+        line: Line on which the fingers close, one of `LINES`.
+    """
+    name = f"{shape}, {line}"
+    if shape == "sphere" and _stands_wide(hand):
+        return judge(name, [], "left out: the fingers stand too wide for a ball")
+
+    # Try until one grasp holds, which only a whole lift shows.
+    config = with_whole_lifts(config)
+    drive = drive_of(hand, config.lift)
+    rules: Drive = "locked" if drive == "torque" else drive
+    locked = config.model_copy(update={"lift": config.lift.model_copy(update={"drive": rules})})
+    outcomes: Counter[str] = Counter()
+    for model, X_TO, pregrasp, width in trial_grasps(hand, shape, line):
+        scene = build_scene(model, config.physics, hand)
+        record = run_attempt(scene, X_TO, pregrasp, locked)
+        if not _stays(record, config):
+            held = record.outcome is Outcome.SUCCESS
+            outcomes[MOVED if held else record.outcome.label] += 1
+            continue
+        text = (
+            f"holds {1e3 * width:.0f} mm and {model.mass:g} kg; {_slip(record)} with "
+            f"fingers that are {_HOW[rules]}"
+        )
+        if drive != "torque":
+            return judge(name, [], text)
+        free = run_attempt(scene, X_TO, pregrasp, config)
+        text += f", and {_slip(free)} with fingers that motors of its own strength keep closed"
+        ok = _stays(free, config) or not LINES[line]
+        return judge(name, [] if ok else [f"{text}: {_SOFT}"], text)
+
+    tried = ", ".join(f"{count} {label}" for label, count in outcomes.items())
+    text = f"a {shape} must be held, got {tried or 'no posture that holds one'}"
+    mend = _MENDS.get(outcomes.most_common(1)[0][0]) if outcomes else None
+    return judge(name, [f"{text}: {mend}" if mend else text], "")
+
+
+def _stands_wide(hand: Hand) -> bool:
+    """Return whether the fingers are too far beside each other to hold a ball."""
+    pinch = find_pinch(hand, max(WIDTHS))
+    if pinch is None:
+        return False
+    axis, _ = find_opposition(hand)
+    across = np.cross([0.0, 0.0, 1.0], axis)
+    aside = np.abs((pinch.p_GQ - pinch.p_GM) @ across).max()
+    return bool(aside > WIDEST * pinch.width)
+
+
+def _stays(record: TrialRecord, config: Config) -> bool:
+    """Return whether an object is held and moves at most as much as a sample may."""
+    if record.outcome is not Outcome.SUCCESS or record.lift is None:
+        return False
+    turned = np.rad2deg(record.lift.turn)
+    return bool(record.lift.slip <= config.lift.stop_slip and turned <= config.lift.stop_turn_deg)
+
+
+def _slip(record: TrialRecord) -> str:
+    """Return how far an object slipped in the lift, in words."""
+    if record.outcome is not Outcome.SUCCESS or record.lift is None:
+        return f"is {record.outcome.label}"
+    return f"slips by {1e3 * record.lift.slip:.2f} mm and {np.rad2deg(record.lift.turn):.1f}°"
+
+
+def trial_grasps(hand: Hand, shape: str, line: str = "level") -> Iterator[TrialGrasp]:
+    """Yield attempts at an object of a few widths, see `check_grasp`."""
+    for width in WIDTHS:
+        pinch = find_pinch(hand, width)
+        grasp = None if pinch is None else _trial_grasp(hand, shape, pinch, LINES[line])
+        if grasp is not None:
+            yield grasp
+
+
+def _trial_grasp(hand: Hand, shape: str, pinch: Pinch, angle: float) -> TrialGrasp | None:
+    """Return an attempt; None if no object fits between palm and fingertips.
+
+    Args:
+        hand: The hand.
+        shape: "box", "cylinder" or "sphere".
+        pinch: The posture in which the hand will hold the object.
+        angle: Angle of the line on which the fingers close, above the horizontal [rad].
+    """
+    # The object's axes: x across the fingers, y along their line, z towards the palm.
+    axis, _ = find_opposition(hand)
+    R_OG = np.stack([np.cross([0.0, 0.0, 1.0], axis), axis, [0.0, 0.0, -1.0]])
+    offsets = (pinch.p_GQ - pinch.p_GM) @ R_OG.T
+    room = float(pinch.p_GM[2]) - BEFORE_PALM
+    aside = float(np.abs(offsets[:, 0]).max())
+    above = min(max(float(offsets[:, 2].max()) + AROUND_PADS, LEAST_SIZE / 2.0), room)
+    below = max(float(-offsets[:, 2].min()) + AROUND_PADS, LEAST_SIZE / 2.0)
+    wide = max(2.0 * (aside + AROUND_PADS), LEAST_SIZE)
+    if above < AROUND_PADS:
+        return None
+
+    # A cylinder lies across the fingers. Fingers beside each other meet a ball beside its centre.
+    radius, p_OM = pinch.width / 2.0, np.zeros(3)
+    if shape == "box":
+        mesh = trimesh.creation.box([wide, pinch.width, above + below]).subdivide().subdivide()
+        p_OM[2] = (below - above) / 2.0
+    elif shape == "cylinder":
+        mesh = trimesh.creation.cylinder(radius, wide, sections=48)
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2.0, [0, 1, 0]))
+    else:
+        radius = max((pinch.width**2 + aside**2) / (2.0 * pinch.width), radius)
+        mesh = trimesh.creation.icosphere(3, radius)
+    if shape != "box" and radius > room:
+        return None
+    mass = MASS if hand.payload is None else min(MASS, hand.payload)
+    model = make_object(
+        mesh.vertices, mesh.faces, ObjectConfig(mass=mass),
+        name=shape, class_name=shape, mesh_sha256="",
+    )  # fmt: skip
+    X_OG = make_pose(R_OG, p_OM - R_OG @ pinch.p_GM)
+
+    # The object hangs so high that the hand is clear of the table.
+    R_TO = rotation_about([1.0, 0.0, 0.0], angle)
+    down = R_OG.T @ R_TO.T @ [0.0, 0.0, -1.0]
+    height = reach(hand, down) - float((R_TO @ X_OG[:3, 3])[2]) + ABOVE_TABLE
+    height = max(height, float(-(mesh.vertices @ R_TO.T)[:, 2].min()) + ABOVE_TABLE)
+    X_TO = make_pose(R_TO, [0.0, 0.0, height])
+    return model, X_TO, Attempt(X_OG=X_OG, spread=0.0), pinch.width
+
+
+@one_thread
+def check_hand(
+    name_or_yaml: str | Path,
+    *,
+    config: Config | None = None,
+    report: Callable[[Finding], None] | None = None,
+) -> list[Finding]:
+    """Return the findings of all checks of a hand.
+
+    A check that others depend on comes before them; if it fails, they are left out.
+
+    Args:
+        name_or_yaml: A hand of the package, or a hand file.
+        config: The rules of the trial grasps; None for the defaults.
+        report: Is called with each finding as soon as it is known.
+    """
+    findings = []
+    for finding in _findings(name_or_yaml, config or load_config()):
+        findings.append(finding)
+        if report is not None:
+            report(finding)
+    return findings
+
+
+def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
+    """Yield the findings, up to a failed check that others depend on."""
+    # The files: without them there is no hand.
+    try:
+        hand = load_hand(name_or_yaml)
+        count = sum(map(len, link_shapes(hand.model).values()))
+    except HandError as error:
+        yield judge("files", [str(error)], "")
+        return
+    joints, model = len(hand.joint_names), hand.model.path.name
+    fine = f"{hand.num_fingers} fingers, {joints} joints, {count} shapes in {model}"
+    yield judge("files", [], fine)
+
+    # Masses, limits and couplings. The other checks close the hand, for which they need its limits.
+    yield check_masses(hand)
+    limits = check_limits(hand)
+    yield limits
+    yield check_couplings(hand)
+    if not limits.ok:
+        return
+    yield check_efforts(hand, config)
+
+    # Geometry, then grasps.
+    sound = True
+    for finding in check_geometry(hand):
+        sound = sound and finding.ok
+        yield finding
+    if sound:
+        for shape, line in GRASPS:
+            yield check_grasp(hand, config, shape, line)

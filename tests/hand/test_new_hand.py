@@ -1,0 +1,312 @@
+"""`drakegrasp hand new`: what is guessed of a hand, and what overrides it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from helpers.machine import needs_egl
+from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_model
+
+from drakegrasp.cli.main import main
+from drakegrasp.errors import HandError
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.draft.fingers import Answers
+from drakegrasp.hand.draft.shapes import THIN, Shape
+from drakegrasp.hand.draft.source import read_model
+from drakegrasp.hand.draft.vendor import doubtful_units
+from drakegrasp.hand.file_format import DrivenBy
+from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.finger_sweep import pad_points_at
+from drakegrasp.hand.kinematics import closed_positions, fingertip_forces
+from drakegrasp.hand_setup.new import NewHand, draft_hand
+
+
+@pytest.fixture(autouse=True)
+def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Geometry decides, but in tests that are marked."""
+    if "sim" not in request.keywords:
+        monkeypatch.setattr("drakegrasp.hand_setup.new.GRASPS", ())
+
+
+def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -> NewHand:
+    path = write_model(folder / "vendor", text, name)
+    return draft_hand(path, folder / "out", answers=Answers(**answers))  # type: ignore[arg-type]
+
+
+def pads(hand: Hand, share: float) -> np.ndarray:
+    """Return the pad points (k, 3) in {G} when the hand has closed by a share."""
+    return pad_points_at(hand, share * closed_positions(hand))
+
+
+@pytest.mark.parametrize(("text", "name"), [(JAWS, "jaws.urdf"), (JAWS_MJCF, "jaws.xml")])
+def test_jaws_that_open_at_positive_positions_are_turned_round(
+    tmp_path: Path, text: str, name: str
+) -> None:
+    drafted = draft(tmp_path, text, name)
+    assert [finding.text for finding in drafted.findings if not finding.ok] == []
+    hand = load_hand(drafted.path)
+    assert hand.palm_link == "body"
+    np.testing.assert_allclose(hand.X_BG[:3, 2], [0.0, 0.0, 1.0], atol=1e-9)
+    # 100 mm apart at zero, closed at the limit; the pads are at the ends of the jaws.
+    gaps = [np.linalg.norm(np.diff(pads(hand, share), axis=0)) for share in (0.0, 1.0)]
+    np.testing.assert_allclose(gaps, [0.1, 0.0], atol=1e-6)
+    assert all(p[2] > 0.04 for p in pads(hand, 0.5))
+    # One motor moves both jaws with 60 N each.
+    driver, driven = hand.fingers
+    assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "factor", "doubt"),
+    [
+        ('(mass value=")(.*?)(")', 1e3, r"its masses are .* kg in all: are they in another unit"),
+        ('(mass value=")(.*?)(")', 1e-3, r"its masses are .* kg in all: are they in another unit"),
+        ('((?:lower|upper)=")(.*?)(")', 57.3, r"its joints turn up to .* limits in degrees\?"),
+        ('((?:lower|upper)=")(.*?)(")', 1e-2, r"its joints turn up to .* angles in radians\?"),
+        ("( )()()", 1.0, None),
+    ],
+)
+def test_units_that_no_hand_has_are_told(
+    tmp_path: Path, pattern: str, factor: float, doubt: str | None
+) -> None:
+    def scaled(found: re.Match[str]) -> str:
+        number = found[2] and str(factor * float(found[2]))
+        return f"{found[1]}{number}{found[3]}"
+
+    model = read_model(write_model(tmp_path, re.sub(pattern, scaled, MITTEN)))
+    doubts = list(doubtful_units(model))
+    assert doubts == [] if doubt is None else re.match(doubt, doubts[0]) and len(doubts) == 1
+
+
+def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:
+    """Counter-clockwise, the thumb last; couplings are the model's."""
+    drafted = draft(tmp_path, MITTEN)
+    assert [finding.text for finding in drafted.findings if not finding.ok] == []
+    hand = load_hand(drafted.path)
+    names = [finger.name for finger in hand.fingers]
+    assert names[-1] == "thumb"
+    assert sorted(names) == ["index", "middle", "thumb"]
+    for finger in hand.fingers[:-1]:
+        (coupling,) = finger.coupled
+        assert coupling.ratio == pytest.approx(0.8)
+    assert set(hand.preshape) == {"thumb_turn"}
+    # The palm faces +x of its link.
+    assert hand.X_BG[0, 2] > 0.9
+
+
+def test_a_hand_of_four_fingers_grasps_with_three(tmp_path: Path) -> None:
+    ring = MITTEN[MITTEN.index('<link name="index') : MITTEN.index('<link name="middle')]
+    ring = ring.replace("index", "ring").replace("0 0.022 0", "0 0 0")
+    hand = load_hand(draft(tmp_path, MITTEN.replace("</robot>", ring + "</robot>")).path)
+    assert len(hand.fingers) == 3 and hand.fingers[-1].name == "thumb"
+
+
+def test_a_mesh_without_thickness_gets_some_on_both_sides() -> None:
+    corners = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.02, 0.06, 0.0], [0.0, 0.06, 0.0]])
+    hull = Shape(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]])).hull()
+    assert hull.vertices is not None
+    half = THIN / 2.0
+    np.testing.assert_allclose(hull.vertices.min(axis=0), [-half] * 3)
+    np.testing.assert_allclose(hull.vertices.max(axis=0), [0.02 + half, 0.06 + half, half])
+
+
+BAR = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01"))
+
+
+def test_bars_of_a_linkage_are_no_fingers(tmp_path: Path) -> None:
+    """A bar of the jaws' motor, which reaches less far than they do."""
+    bar = BAR + joint("bar_slide", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60",
+                      '<mimic joint="left_slide"/>')  # fmt: skip
+    hand = load_hand(draft(tmp_path, JAWS.replace("</robot>", bar + "</robot>")).path)
+    assert set(hand.fingertip_links) == {"left_jaw", "right_jaw"}
+    assert any(c.joint == "bar_slide" for finger in hand.fingers for c in finger.coupled)
+
+
+def test_a_bar_may_be_the_joint_that_leads(tmp_path: Path) -> None:
+    """As in grippers whose fingers follow a knuckle beside them."""
+    bar = BAR + joint("knuckle", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60")
+    text = JAWS.replace('"left_slide"/>', '"knuckle"/>').replace("</robot>", bar + "</robot>")
+    slide = text.index("</joint>", text.index('name="left_slide"'))
+    hand = load_hand(draft(tmp_path, text[:slide] + '<mimic joint="knuckle"/>' + text[slide:]).path)
+    driver, driven = hand.fingers
+    assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
+    assert any(c.joint == "knuckle" for finger in hand.fingers for c in finger.coupled)
+
+
+def test_both_sides_press_equally(tmp_path: Path) -> None:
+    """Two fingers of 1 N m would press harder than the thumb resists, or the other way round."""
+    index, middle, thumb = fingertip_forces(load_hand(draft(tmp_path, MITTEN).path), "torque")
+    assert index + middle == pytest.approx(thumb, rel=0.15)
+
+
+def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
+    """A thumb whose last joint has a tenth of the torque presses less."""
+    strong = '<axis xyz="0 -1 0"/><limit lower="0" upper="1.2" effort="1.0"'
+    weak = MITTEN.replace(strong, strong.replace("1.0", "0.1"))
+    assert weak != MITTEN
+    limits = []
+    for n, text in enumerate((MITTEN, weak)):
+        hand = load_hand(draft(tmp_path / str(n), text).path)
+        limits.append(hand.fingers[-1].torque_limit)
+    assert limits[1] < 0.5 * limits[0]
+
+
+@pytest.mark.parametrize(
+    ("in_model", "answer", "message"),
+    [
+        ("60", 2000.0, r"^--effort must be 0\.5\.\.1000 N for joint 'left_slide', got 2000$"),
+        ("2000", None, r"joint 'left_slide' must be .* got 2000 in the model"),
+    ],
+)
+def test_an_effort_that_no_motor_has_is_named_with_its_source(
+    tmp_path: Path, in_model: str, answer: float | None, message: str
+) -> None:
+    text = JAWS.replace('effort="60"', f'effort="{in_model}"')
+    with pytest.raises(HandError, match=message):
+        draft(tmp_path, text, effort=answer)
+
+
+def test_a_finger_that_an_answer_drops_is_noted(tmp_path: Path) -> None:
+    """Reversed it no longer closes as the others do."""
+    text = MITTEN.replace('<mimic joint="middle_1" multiplier="0.8"/>', "")
+    drafted = draft(tmp_path, text, reverse=("middle_1",))
+    tips = {finger.fingertip for finger in load_hand(drafted.path).fingers}
+    assert tips == {"index_far", "thumb_far"}
+    assert [note for note in drafted.notes if note.startswith("finger")] == [
+        "finger middle_far is not used: none of its joints closes it"
+    ]
+
+
+def test_spread_joints_are_told_from_those_that_close(tmp_path: Path) -> None:
+    """From SDFormat, with meshes, of the package's own hand."""
+    drafted = draft_hand(MODELS / "barrett_hand.sdf", tmp_path / "out", answers=Answers(effort=2.0))
+    assert [finding.text for finding in drafted.findings if not finding.ok] == []
+    hand, own = load_hand(drafted.path), load_hand("barrett")
+    assert set(hand.spread.joints) == set(own.spread.joints)
+    assert {f.closing_joint for f in hand.fingers} == {f.closing_joint for f in own.fingers}
+    assert {f.fingertip for f in hand.fingers} == set(own.fingertip_links)
+    np.testing.assert_allclose(hand.X_BG[:3, 2], own.X_BG[:3, 2], atol=0.02)
+    np.testing.assert_allclose(hand.X_BG[2, 3], own.X_BG[2, 3], atol=0.005)
+
+
+def test_the_folder_is_complete_by_itself(tmp_path: Path) -> None:
+    """With the vendor's licence."""
+    vendor = tmp_path / "vendor"
+    write_model(vendor, "MIT", "LICENSE.txt")
+    drafted = draft(tmp_path, MITTEN)
+    shutil.rmtree(vendor)
+    moved = tmp_path / "moved"
+    drafted.path.parent.rename(moved)
+    assert load_hand(moved / drafted.path.name).num_fingers == 3
+    assert (moved / "LICENSE.txt").read_text() == "MIT"
+
+
+def test_a_licence_above_the_model_is_copied_and_told_of(tmp_path: Path) -> None:
+    """The nearest one, and none from above a repository."""
+    root = tmp_path / "repository"
+    vendor = root / "robots" / "hands"
+    vendor.mkdir(parents=True)
+    for folder, text in ((tmp_path, "another's"), (root, "MIT")):
+        (folder / "LICENSE").write_text(text)
+    (root / ".git").mkdir()
+    model = write_model(vendor, MITTEN)
+    drafted = draft_hand(model, tmp_path / "out")
+    assert (drafted.path.parent / "LICENSE").read_text() == "MIT"
+    assert (
+        f"{root / 'LICENSE'} is copied: check that it is the licence of the model" in drafted.notes
+    )
+    (root / "LICENSE").unlink()
+    assert not (draft_hand(model, tmp_path / "bare").path.parent / "LICENSE").exists()
+
+
+def test_guesses_have_reasons_above_them(tmp_path: Path) -> None:
+    """Of the keys that the file has, and of no others."""
+    text = draft(tmp_path, MITTEN, joints={"thumb_turn": 0.3}).path.read_text()
+    assert text.startswith("# Drafted from hand.urdf by `drakegrasp hand new`.")
+    tree, told = yaml.safe_load(text), re.findall(r"^# ([a-z_.B-G]+\w*): ", text, re.MULTILINE)
+    keys = {*tree, *(f"fingers.{key}" for key in tree["fingers"][0])}
+    assert {*told} - {"look", "Units"} <= keys | {f"palm.{key}" for key in tree["palm"]} | {
+        "preshape.thumb_turn"
+    }
+    assert keys - {*told} == {"version", "model", "palm", "fingers.name"}
+
+
+def test_answers_override_guesses(tmp_path: Path) -> None:
+    drafted = draft(
+        tmp_path,
+        MITTEN,
+        palm="palm",
+        approach=np.array([1.0, 0.0, 0.0]),
+        fingers=("index_far", "thumb_far"),
+        joints={"thumb_turn": 0.3},
+        effort=0.5,
+        settings=("drive=torque", "payload=0.2"),
+    )
+    tree = yaml.safe_load(drafted.path.read_text())
+    assert {finger["fingertip"] for finger in tree["fingers"]} == {"index_far", "thumb_far"}
+    assert tree["preshape"]["thumb_turn"] == 0.3
+    assert (tree["drive"], tree["payload"]) == ("torque", 0.2)
+    np.testing.assert_allclose(load_hand(drafted.path).X_BG[:3, 2], [1.0, 0.0, 0.0], atol=2e-3)
+    limits = [finger["torque_limit"] for finger in tree["fingers"]]
+    whole = yaml.safe_load(draft(tmp_path / "whole", MITTEN).path.read_text())
+    assert max(limits) <= 0.5 * 1.6
+    assert "middle_1" in tree["preshape"]
+    assert "middle_1" not in whole.get("preshape", {})
+
+
+def test_a_joint_that_is_given_a_position_does_not_close(tmp_path: Path) -> None:
+    drafted = draft(tmp_path, MITTEN, joints={"thumb_2": 0.4})
+    hand = load_hand(drafted.path)
+    assert hand.preshape["thumb_2"] == 0.4
+    assert hand.fingers[-1].coupled == ()
+
+
+def test_fingers_that_close_side_by_side_are_no_hand(tmp_path: Path) -> None:
+    """The message says what may be answered."""
+    with pytest.raises(HandError, match=r"close against each other: .* --joint NAME=POSITION"):
+        draft(tmp_path, MITTEN, fingers=("index_far", "middle_far"))
+
+
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [
+        ({"palm": "wrist"}, r"--palm must be one of body, .* got 'wrist'"),
+        ({"fingers": ("left_jaw", "thumb")}, r"--fingers must be of .* got 'thumb'"),
+        ({"joints": {"thumb": 0.0}}, r"--joint must name one of left_slide, .* got 'thumb'"),
+        ({"joints": {"left_slide": 1.0}}, r"--joint left_slide must be 0..0.05, got 1"),
+        ({"reverse": ("thumb",)}, r"--reverse must name one of .* got 'thumb'"),
+        ({"settings": ("drive",)}, r"--set must be KEY=VALUE"),
+    ],
+)
+def test_an_answer_that_cannot_be_used_is_refused(
+    tmp_path: Path, answers: dict[str, object], message: str
+) -> None:
+    with pytest.raises(HandError, match=message):
+        draft(tmp_path, JAWS, **answers)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_files_is_not_written_over(tmp_path: Path) -> None:
+    write_model(tmp_path / "out", "mine", "notes.txt")
+    with pytest.raises(HandError, match="--out must be a new or empty folder"):
+        draft(tmp_path, JAWS)
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@needs_egl
+def test_a_drafted_gripper_passes_every_check(tmp_path: Path) -> None:
+    """Two commands, and no answer."""
+    path, out = write_model(tmp_path, JAWS, "jaws.urdf"), tmp_path / "out"
+    result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert (out / "jaws_hand.png").read_bytes().startswith(b"\x89PNG")
+    result = CliRunner().invoke(main, ["hand", "check", str(out / "jaws_hand.yaml")])
+    assert result.exit_code == 0, result.output
