@@ -42,9 +42,9 @@ import click
 import h5py
 import numpy as np
 import trimesh
+from drakegrasp.hand_setup.checks import check_geometry, check_limits
 
 from drakegrasp.cli.main import main as command
-from drakegrasp.commissioning.checks import check_geometry, check_limits
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.trials import Trials
