@@ -42,13 +42,13 @@ import click
 import h5py
 import numpy as np
 import trimesh
-from drakegrasp.hand_setup.checks import check_geometry, check_limits
 
 from drakegrasp.cli.main import main as command
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DrakegraspError
+from drakegrasp.hand.checks import check_geometry, check_limits
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.shapes import link_shapes
