@@ -6,7 +6,7 @@ NumPy, and importing this package starts neither Drake nor Dask.
 
 from __future__ import annotations
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from drakegrasp.verification.result import PoseTrial, Verification
     from drakegrasp.vision.depth_image import cloud_from_depth, fit_table
 
-__version__ = metadata.version("drakegrasp")
+    __version__: str
 
 #: The module of each name.
 _HOMES = {
@@ -155,6 +155,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib import metadata  # takes longer to load than the rest of this module
+
+        return metadata.version("drakegrasp")
     if name not in _HOMES:
         raise AttributeError(f"module 'drakegrasp' has no attribute {name!r}")
     return getattr(import_module(f"drakegrasp.{_HOMES[name]}"), name)

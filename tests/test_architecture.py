@@ -51,7 +51,7 @@ LONG_BODY = 20
 WALLS = {
     "dask": ("cluster",),
     "distributed": ("cluster",),
-    "click": ("cli",),
+    "cyclopts": ("cli",),
     "starlette": ("page",),
     "uvicorn": ("page",),
     "jinja2": ("page",),
@@ -70,7 +70,7 @@ NAMES_TYPES = {
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (
     *("pydrake", "dask", "distributed", "trimesh", "scipy", "matplotlib", "rich", "pydantic"),
-    *("yaml", "click", "torch"),
+    *("yaml", "cyclopts", "torch"),
 )
 READERS = (
     *("grasp", "dataset.schema", "dataset.shards", "dataset.reader", "dataset.trials"),

@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
-from click.testing import CliRunner
+from helpers.commands import run
 from helpers.datasets import BOXES
 from helpers.meshes import write_fixed
 from helpers.tiers import in_second_tier
 
-from drakegrasp.cli.main import main
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import Decisions, write_decisions
 from drakegrasp.hand.settings import load_config
@@ -239,7 +238,7 @@ def test_commands_of_the_docs_run(
     # Nobody simulated this dataset, so its attempts cannot be run again.
     choices = [choice for choice in choices if choice != "lerobot"]
     for choice in choices:
-        done = CliRunner().invoke(main, [choice if "|" in word else word for word in words])
+        done = run(*(choice if "|" in word else word for word in words))
         assert done.exit_code == 0, f"{LINES[line]}: {done.output}"
         if "FOLDER" in words:
             assert any((tmp_path / "FOLDER").iterdir())
@@ -291,7 +290,7 @@ def test_commands_that_simulate_run(
     with h5py.File(tmp_path / "predictions.h5", "w") as file:
         file["test/grasps"], file["test/rows"] = data.column("grasps")[:1], np.array([0])
 
-    done = CliRunner().invoke(main, words)
+    done = run(*words)
     assert done.exit_code == 0, f"{LINES[line]}: {done.output}"
     for option in ("--html", "--out"):
         if option in words:

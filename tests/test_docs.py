@@ -12,9 +12,10 @@ import builtin_objects
 import click
 import dataset_format
 import pytest
+from cyclopts import App
 from helpers.scripts import load_script
 
-from drakegrasp.cli.main import main
+from drakegrasp.cli.main import COMMANDS, app
 from drakegrasp.config import Config
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
@@ -190,38 +191,35 @@ def _bases(page: Path, name: str) -> list[Path]:
     return [ROOT, page.parent, package, ROOT / "pipelines" / "recipes", *rooms]
 
 
-def commands() -> dict[str, click.Command]:
-    """Return the commands that have a section on their page."""
-    return dict(main.commands)
-
-
-def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
-    """Yield the commands of a page's plain code blocks with their arguments."""
+def command_lines(page: Path) -> Iterator[tuple[str, set[str], list[str]]]:
+    """Yield the commands of a page's plain code blocks with their options and arguments."""
     text = "\n".join(blocks(page, "")).replace("\\\n", " ")
     for name, rest in re.findall(r"^drakegrasp ([a-z][a-z-]*)(.*)", text, re.M):
-        yield main.commands[name], shlex.split(rest, comments=True)
+        yield name, options_of(app[name]), shlex.split(rest, comments=True)
     # The baseline cannot be loaded without torch; tests/test_baseline.py runs it.
     for script, rest in re.findall(r"^python pipelines/(?!baseline/)([\w/]+)\.py(.*)", text, re.M):
         command = load_script(script).main
-        if isinstance(command, click.Command):  # the others read their options with argparse
-            yield command, shlex.split(rest, comments=True)
+        if isinstance(command, click.Command):  # the others are tested as commands
+            options = {name for each in command.params for name in each.opts}
+            yield script, options, shlex.split(rest, comments=True)
 
 
-def options_of(command: click.Command) -> set[str]:
+def options_of(command: App) -> set[str]:
     """Return the options of a command, of a group those of all its commands."""
-    given = [param for param in command.params if isinstance(param, click.Option)]
-    options = {name for param in given for name in (*param.opts, *param.secondary_opts)}
-    below = command.commands.values() if isinstance(command, click.Group) else ()
-    return options.union({"--help", "-h"}, *map(options_of, below))
+    below = [command[name] for name in command if not name.startswith("-")]
+    options = {"--help", "-h"}.union(*map(options_of, below))
+    if command.default_command is not None:
+        options |= {name for each in command.assemble_argument_collection() for name in each.names}
+    return {name for name in options if name.startswith("-")}
 
 
 @pytest.mark.parametrize("page", DOCS, ids=page_id)
 def test_commands_and_options_in_the_docs_exist(page: Path) -> None:
     for name in re.findall(r"`drakegrasp ([a-z][a-z-]*)", read(page)):
-        assert name in main.commands
-    for command, words in command_lines(page):
-        unknown = {word for word in words if word.startswith("-")} - options_of(command)
-        assert not unknown, f"{command.name} {words}"
+        assert name in COMMANDS
+    for name, options, words in command_lines(page):
+        unknown = {word for word in words if word.startswith("-")} - options
+        assert not unknown, f"{name} {words}"
 
 
 def test_docs_name_commands() -> None:
@@ -231,11 +229,11 @@ def test_docs_name_commands() -> None:
 
 def test_the_command_page_has_every_command_and_its_options() -> None:
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", read(COMMAND_PAGE), re.M | re.S))
-    assert list(sections) == list(commands())
-    shared = options_of(main.commands["build"])
-    for name, command in commands().items():
+    assert list(sections) == list(COMMANDS)
+    shared = options_of(app["build"])
+    for name in COMMANDS:
         named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", sections[name]))
-        options = options_of(command) - {"--help", "-h"}
+        options = options_of(app[name]) - {"--help", "-h"}
         assert named <= options | shared, name
         # `submit` takes the options of a build, which its section refers to.
         assert options <= named | (shared if name == "submit" else set()), name

@@ -33,13 +33,7 @@ from drakegrasp.generation.pipeline import (
     refuse_part,
     refuse_unusable,
 )
-from drakegrasp.generation.request import (
-    BUILTIN,
-    BuildRequest,
-    Part,
-    read_part,
-    refuse_unknown,
-)
+from drakegrasp.generation.request import BUILTIN, Part, read_part, refuse_unknown
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.settings import load_config
@@ -67,6 +61,7 @@ def build_dataset(
     part: str | None = None,
     read_as: Mapping[str, str] | None = None,
     client: Client | None = None,
+    cluster: AbstractContextManager[Client] | None = None,
     show: bool = True,
     **workers: Unpack[Workers],
 ) -> BuildReport:
@@ -90,6 +85,8 @@ def build_dataset(
         read_as: How to read all postures of a file: `frame` and `link` override what the file
             states; `preshape` applies to rows that name none.
         client: A Dask client whose workers do the work, e.g. from `connect`.
+        cluster: Instead of a client: starts the workers when the directory is known to be usable,
+            and yields their client.
         show: Whether to show progress on standard error.
         workers: The arguments of `connect`, instead of a client; one process per core if neither
             is given.
@@ -105,7 +102,7 @@ def build_dataset(
             the same call continues when that is fixed.
     """
     refuse_address(out)
-    cluster = joined(client, workers)
+    running = joined(client, workers) if cluster is None else cluster
     out, config = Path(out).absolute(), config or load_config(BUILD_PRESET)
     hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
@@ -113,7 +110,7 @@ def build_dataset(
         postures = read_attempts(Path(postures), hand, read_as=read_as)
     sources = find_sources(objects, units, manifest)
     return build_on(
-        cluster,
+        running,
         sources,
         out,
         config,
@@ -239,41 +236,44 @@ def _chosen(
     return only, postures
 
 
-def known_work(request: BuildRequest, part: str | None = None) -> list[str]:
+def known_work(
+    objects: str | Path,
+    *,
+    config: Config,
+    units: str = "m",
+    manifest: str | Path | None = None,
+    only: Sequence[str] = (),
+    postures: Path | None = None,
+    part: str | None = None,
+    read_as: Mapping[str, str] | None = None,
+) -> list[str]:
     """Return lines on the work of a build as far as it is known before; nothing is written.
 
-    Args:
-        request: What to build.
-        part: See `build_dataset`.
-
-    Raises:
-        MeshError, GraspError, ConfigError: As `build_dataset`.
+    Arguments and errors are those of `build_dataset`.
     """
-    hand = load_hand(request.config.hand_source)
-    postures = None
-    if request.postures is not None:
-        postures = read_attempts(request.postures, hand, read_as=request.read_as)
-    config = ended(posture_config(request.config, postures))
+    hand = load_hand(config.hand_source)
+    table = None if postures is None else read_attempts(postures, hand, read_as=read_as)
+    config = ended(posture_config(config, table))
     refuse_unusable(config)
     job = None if part is None else read_part(part)
     refuse_part(job, config)
     drive_of(hand, config.lift)
-    names = _names(find_sources(request.objects, request.units, request.manifest), config)
-    only, postures = _chosen(names, request.only, postures)
-    objects = len(set(only or names))
+    names = _names(find_sources(objects, units, manifest), config)
+    only, table = _chosen(names, only, table)
+    count = len(set(only or names))
 
     # A posture is tried in each resting pose and with each preshape that it allows.
-    if postures is not None:
-        rows = sum(len(postures.of_object(name)) for name in only)
-        return [f"{counted(objects, 'object')}: {counted(rows, 'posture')}"]
+    if table is not None:
+        rows = sum(len(table.of_object(name)) for name in only)
+        return [f"{counted(count, 'object')}: {counted(rows, 'posture')}"]
     if config.has_target:
-        return _target_lines(config, objects)
+        return _target_lines(config, count)
     poses = config.candidates.max
-    units = objects * sum(1 for _ in config.unit_ranges(poses))
-    palms = counted(objects * poses, "palm pose")
-    lines = [f"{counted(objects, 'object')}: at most {palms} in {counted(units, 'work unit')}"]
+    work_units = count * sum(1 for _ in config.unit_ranges(poses))
+    palms = counted(count * poses, "palm pose")
+    lines = [f"{counted(count, 'object')}: at most {palms} in {counted(work_units, 'work unit')}"]
     if job is not None:
-        of_job = sum(map(job.has, range(units)))
+        of_job = sum(map(job.has, range(work_units)))
         lines.append(f"part {part}: at most {of_job:,} of these work units")
     return lines
 

@@ -10,24 +10,20 @@ from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 import numpy.typing as npt
 
+from drakegrasp.api.protocols import verify_by_protocol
 from drakegrasp.api.verifying import run_verification
 from drakegrasp.cluster.connect import Workers
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
-from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
-from drakegrasp.hand.description import load_hand
-from drakegrasp.protocols.postures import describe, prepare_trials, verify_postures, versions
+from drakegrasp.protocols.postures import describe, versions
 from drakegrasp.protocols.protocol import Lift, find_protocol
 from drakegrasp.runtime.environment import require_mujoco
-from drakegrasp.runtime.executor import processes
-from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Method, Score
 from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import GraspRows
 from drakegrasp.verification.placing import (
-    PlacedGrasp,
     dataset_config,
     overridden_keys,
     place_on_rows,
@@ -115,9 +111,17 @@ def score(
     def try_all(grasps: GraspRows, chosen: Sequence[int], deliver: Deliver) -> None:
         placed = place_on_rows(grasps, dataset, chosen, config=used, overrides=settings)
         if peer:
-            keep = Path(scratch if out is None else out) / CONVEX_PARTS
-            count = workers.get("workers")
-            _try_by_protocol(placed, protocol, deliver, keep=keep, workers=count, show=show)
+            verify_by_protocol(
+                placed,
+                used,
+                protocol,
+                lambda i, result, _: deliver(
+                    placed[i].index, protocol_verdict(placed[i], result[0])
+                ),
+                keep=Path(scratch if out is None else out) / CONVEX_PARTS,
+                workers=workers.get("workers"),
+                show=show,
+            )
             return
         run_verification(
             placed,
@@ -170,31 +174,3 @@ def _training_rows(dataset: GraspDataset, references: Sequence[str]) -> GraspDat
     if type(dataset) is GraspDataset:
         return GraspDataset(dataset.path, split="train", fewer_fingers=not references)
     return type(dataset)(dataset.path, split="train")
-
-
-def _try_by_protocol(
-    grasps: Sequence[PlacedGrasp],
-    protocol: str,
-    deliver: Deliver,
-    *,
-    keep: Path,
-    workers: int | None,
-    show: bool,
-) -> None:
-    """Try the first wrist pose of grasps by a protocol of MuJoCo."""
-    hand = load_hand(grasps[0].config.hand_source)
-    with TemporaryDirectory() as folder, processes(workers) as execute:
-        with progress_bar("cut", "objects", show=show) as report:
-            path, files = write_grasps(
-                fitted_postures(grasps, execute),
-                hand,
-                Path(folder),
-                execute=execute,
-                keep=keep,
-                report=report,
-            )
-        with progress_bar("score", "grasps", show=show) as report:
-            found = verify_postures(files, prepare_trials(protocol, path, Path(folder)), execute)
-            for done, (grasp, (verdict, _)) in enumerate(zip(grasps, found, strict=True), start=1):
-                deliver(grasp.index, protocol_verdict(grasp, verdict))
-                report(done, len(grasps))

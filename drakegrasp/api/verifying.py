@@ -19,16 +19,20 @@ from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, joined
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange.columns import HDF5_SUFFIXES
+from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.simulation.attempts import Attempts, GraspRows
 from drakegrasp.simulation.placement import Placed, place_object
 from drakegrasp.verification.placing import (
     PlacedGrasp,
     RowChoice,
     dataset_config,
+    place_on_dataset,
     place_on_object,
     place_on_rows,
 )
@@ -96,7 +100,7 @@ def verify_grasp(
         raise GraspError(f"row must be one whole number, got {row!r}")
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
-    placed, used = _place(
+    placed, used = place_grasps(
         grasp,
         on,
         row,
@@ -178,7 +182,7 @@ def verify_grasps(
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
-    placed, used = _place(
+    placed, used = place_grasps(
         grasps,
         on,
         rows,
@@ -194,25 +198,49 @@ def verify_grasps(
     return run_verification(placed, used, client=client, show=show, explained=False)
 
 
-def _place(
-    grasps: npt.ArrayLike,
+def place_grasps(
+    grasps: npt.ArrayLike | GraspRows,
     on: GraspTarget,
-    rows: RowChoice,
+    rows: RowChoice = None,
     *,
-    frame: str | None,
-    X_TC: npt.ArrayLike | None,
-    units: str | None,
-    X_TO: npt.ArrayLike | None,
-    hand: str | Path | None,
-    method: str,
-    snap_points: bool,
-    config: Config | None,
+    frame: str | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    units: str | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    hand: str | Path | None = None,
+    method: str = "hand",
+    snap_points: bool = False,
+    config: Config | None = None,
+    overrides: tuple[str, ...] = (),
 ) -> tuple[list[PlacedGrasp], Config]:
-    """Return the grasps on their target, and the configuration; see `verify_grasps`."""
+    """Return grasps on their target, and the configuration, as `run_verification` takes them.
+
+    Args:
+        grasps: As for `verify_grasps`, or a table of contacts or postures, see `read_attempts`.
+        on: As for `verify_grasps`, or the directory of a dataset whose objects the postures name.
+        rows: See `verify_grasps`, as for all arguments but the last.
+        frame: See `verify_grasps`.
+        X_TC: See `verify_grasps`.
+        units: See `verify_grasps`.
+        X_TO: See `verify_grasps`.
+        hand: See `verify_grasps`.
+        method: See `verify_grasps`.
+        snap_points: See `verify_grasps`.
+        config: See `verify_grasps`; it has the overrides already.
+        overrides: `"key=value"` settings that override the configuration of a dataset, and values
+            that were drawn for a row.
+
+    Raises:
+        GraspError, MeshError, ConfigError, HandError, DataError: As `verify_grasps`.
+    """
     _refuse_other_targets(on)
     if not isinstance(on, Sample | GraspDataset):
         if rows is not None:
             raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
+        if isinstance(grasps, Attempts) and isinstance(on, Path) and on.is_dir():
+            used = override_config(read_manifest(on).config, overrides)
+            own = used if overrides else None
+            return place_on_dataset(grasps, on, own, overrides=overrides), used
         thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
         placed = place_on_object(
             grasps,
@@ -221,13 +249,16 @@ def _place(
             X_TC=X_TC,
             method=method,
             snap_points=snap_points,
+            overrides=overrides,
         )
         return placed, thing.config
     _refuse_given(on, X_TC=X_TC, units=units, X_TO=X_TO)
     if isinstance(on, Sample) and rows is not None:
         raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
     data, rows = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
-    used = dataset_config(data, config, hand)
+    # A given configuration is used as it is; that of a dataset is combined with the rows' draws.
+    overrides = overrides if config is None else ()
+    used = dataset_config(data, config, hand, overrides)
     placed = place_on_rows(
         grasps,
         data,
@@ -237,6 +268,7 @@ def _place(
         frame=frame or "camera",
         method=method,
         snap_points=snap_points,
+        overrides=overrides,
     )
     return placed, used
 

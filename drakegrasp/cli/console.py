@@ -1,27 +1,27 @@
-"""Output, errors, exit codes and help of the commands.
+"""Output, errors and exit codes of the commands.
 
 Every error is one line on standard error and an exit code: 0 done, 1 the work failed, 2 wrong
 usage, 130 Ctrl-C, 143 SIGTERM. Printed text has no control characters, whatever names it contains.
-In help output, common options come first, and rare options follow under a separate heading.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from difflib import get_close_matches
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-import click
+from cyclopts import App, CycloptsError
 
 from drakegrasp.errors import (
     ConfigError,
+    DataError,
     DrakegraspError,
     GraspError,
     HandError,
@@ -36,16 +36,14 @@ if TYPE_CHECKING:
 _UTF8, _STREAMS = "PYTHONUTF8", "PYTHONIOENCODING"
 #: A signal that arrives while a module is imported is sent again after this time [s].
 AGAIN_SECONDS = 0.05
-#: Minimum similarity of a known option to an unknown one to be proposed [ratio of `difflib`].
-ALIKE = 0.75
+
+
+class UsageError(DrakegraspError):
+    """Options or arguments that do not fit each other."""
+
+
 #: Errors in the user's input. All other errors are failures of the work.
-WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
-
-
-def say_finding(ok: bool, bad: str, text: str) -> None:
-    """Print a line that begins with a green `ok`, or with another word in red."""
-    word = click.style("ok".ljust(len(bad)), fg="green") if ok else click.style(bad, fg="red")
-    click.echo(f"{word}  {printable(text)}")
+WRONG_USAGE = (UsageError, ConfigError, GraspError, HandError, MeshError)
 
 
 def say(text: str, *, err: bool = False) -> None:
@@ -55,12 +53,21 @@ def say(text: str, *, err: bool = False) -> None:
         text: One line or more.
         err: Whether to print to standard error.
     """
-    click.echo("\n".join(map(printable, text.split("\n"))), err=err)
+    stream = sys.stderr if err else sys.stdout
+    print("\n".join(map(printable, text.split("\n"))), file=stream, flush=True)
 
 
-def say_json(document: Mapping[str, Any]) -> None:
-    """Print a document as strict JSON on one line."""
-    click.echo(json.dumps(document, allow_nan=False))
+def say_finding(ok: bool, bad: str, text: str) -> None:
+    """Print a line that begins with a green `ok`, or with another word in red."""
+    word = "ok".ljust(len(bad)) if ok else bad
+    if sys.stdout.isatty():
+        word = f"\x1b[{32 if ok else 31}m{word}\x1b[0m"
+    print(f"{word}  {printable(text)}", flush=True)  # noqa: T201
+
+
+def say_json(document: Mapping[str, Any], *, indent: int | None = None) -> None:
+    """Print a document as strict JSON, on one line if it is not indented."""
+    say(json.dumps(document, allow_nan=False, indent=indent))
 
 
 def progress_bar(title: str, unit: str, *, show: bool = True) -> AbstractContextManager[Report]:
@@ -70,99 +77,86 @@ def progress_bar(title: str, unit: str, *, show: bool = True) -> AbstractContext
     return progress.progress_bar(title, unit, show=show)
 
 
-class Command(click.Command):
-    """A command whose help has a section for each heading of its options."""
+@contextmanager
+def processes(
+    workers: int | None, title: str, unit: str, *, show: bool = True
+) -> Iterator[dict[str, Any]]:
+    """Yield the arguments `execute` and `progress` of a function that works in processes."""
+    from drakegrasp.runtime import executor
 
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options; called by click."""
-        sections: dict[str, list[tuple[str, str]]] = {"Options": []}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is not None and not isinstance(parameter, click.Argument):
-                heading = getattr(parameter, "heading", "Options")
-                sections.setdefault(heading, []).append(record)
-        for heading, records in sections.items():
-            if records:
-                with formatter.section(heading):
-                    formatter.write_dl(records)
+    with executor.processes(workers) as execute, progress_bar(title, unit, show=show) as progress:
+        yield {"execute": execute, "progress": progress}
 
 
-class OneCommand(Command):
-    """The only command of a script, with errors on one line; also the base of `Commands`."""
-
-    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Read the command line; for a group, the options before the name of the command."""
-        with one_line_errors():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the requested command."""
-        of_group = isinstance(self, click.Group)
-        with one_line_errors(lambda: not of_group or ctx.invoked_subcommand == "build"):
-            return super().invoke(ctx)
+def same_command(flags: Sequence[str], options: Sequence[str]) -> str:
+    """Return the running command without some flags, and without some options with a value."""
+    kept, left = ["drakegrasp"], iter(sys.argv[1:])
+    for word in left:
+        if word in options:
+            next(left, None)
+        elif word not in flags and word.partition("=")[0] not in options:
+            kept.append(word)
+    return shlex.join(kept)
 
 
-class Commands(OneCommand, click.Group):
-    """Commands in the order of their definition, with errors on one line."""
+def run_command(app: App, words: Sequence[str], *, resumable: bool = False) -> None:
+    """Run the command that words name, with errors as one line and an exit code.
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the commands' names."""
-        return list(self.commands)
+    Args:
+        app: The commands.
+        words: The command line without the name of the program.
+        resumable: Whether the same command continues after Ctrl-C.
 
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options and the commands; called by click."""
-        click.Group.format_options(self, ctx, formatter)
+    Raises:
+        SystemExit: If the command fails.
+    """
+    with one_line_errors(resumable):
+        app(words, exit_on_error=False, print_error=False, result_action="return_value")
 
 
 @contextmanager
-def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[None]:
-    """Turn errors within the block into one line on standard error and an exit code.
-
-    Args:
-        resumable: Function that tells whether the same command continues after Ctrl-C.
-    """
+def one_line_errors(resumable: bool) -> Iterator[None]:
+    """Turn errors within the block into one line on standard error and an exit code."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGTERM, _stop)
     if before[signal.SIGINT] is signal.default_int_handler:  # a shell may have it ignored
         signal.signal(signal.SIGINT, _stop)
     try:
         yield
-    except click.exceptions.NoArgsIsHelpError:
-        raise
-    except click.UsageError as error:
-        if isinstance(error, click.NoSuchOption):
-            # Click also compares the dashes, so any two short names are similar.
-            names = {each.lstrip("-"): each for each in error.possibilities or ()}
-            near = get_close_matches(error.option_name.lstrip("-"), names, cutoff=ALIKE)
-            error = click.NoSuchOption(error.option_name, possibilities=[names[n] for n in near])
-        _end(f"error: {_one_line(error.format_message())}", 2)
-    except DrakegraspError as error:
-        code = 2 if isinstance(error, WRONG_USAGE) else 1
-        _end(f"error: {_one_line(str(error))}", code)
-    except (click.Abort, click.exceptions.Exit, BrokenPipeError):
-        # Click handles these; a reader that closes the pipe needs no more output.
-        raise
+        sys.stdout.flush()
+    except (CycloptsError, DrakegraspError) as error:
+        # An error of ours that a validator raises is the cause of one of the library.
+        cause = error.__cause__ if isinstance(error.__cause__, DrakegraspError) else error
+        code = 2 if isinstance(cause, (CycloptsError, *WRONG_USAGE)) else 1
+        _end(f"error: {' '.join(str(cause).split())}", code)
+    except BrokenPipeError:
+        # The reader needs no more output, and Python must not try to write it again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except (OSError, RuntimeError) as error:
-        text = str(error).strip() or type(error).__name__
-        _end(f"error: {text.splitlines()[0]}", 1)
+        _end(f"error: {first_line(error)}", 1)
     except MemoryError as error:
         _end(f"error: not enough memory on this machine ({first_line(error)})", 1)
     except KeyboardInterrupt as stop:
-        line = "stopped" + "; the same command continues from here" * resumable()
+        line = "stopped" + "; the same command continues from here" * resumable
         _end(line, 143 if isinstance(stop, _Terminated) else 130)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
+@contextmanager
+def wrong_input() -> Iterator[None]:
+    """Turn an error of a dataset that the user names as input into wrong usage."""
+    try:
+        yield
+    except DataError as error:
+        raise GraspError(str(error)) from None
+
+
 def _end(line: str, code: int) -> NoReturn:
-    """Print a line and have click end the program; click's own errors take four lines."""
     say(line, err=True)
-    raise click.exceptions.Exit(code)
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    sys.exit(code)
 
 
 class _Terminated(KeyboardInterrupt):

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from drakegrasp.cli.arguments import Folder
+from drakegrasp.cli.console import say, say_finding
 from drakegrasp.runtime.environment import available_cores
-from drakegrasp.vision.probe_image import probe_image
 
 PYTHON = (3, 11)
 #: Drake's wheels are built for this C library (manylinux_2_34).
@@ -58,6 +59,25 @@ class Finding:
     ok: bool
     what: str
     remedy: str = ""
+
+
+def doctor(directory: Folder = Path("."), /) -> None:
+    """Check that this machine can run drakegrasp.
+
+    The command reports what is missing and how to install it. The exit code is 1 if anything is
+    missing.
+
+    Args:
+        directory: Directory in which a dataset would be written.
+    """
+    # One line per requirement, and a second line with the remedy if it is not met.
+    findings = diagnose(directory)
+    for finding in findings:
+        say_finding(finding.ok, "MISSING", f"{finding.name:<18} {finding.what}")
+        if not finding.ok:
+            say(f"         -> {finding.remedy}")
+    if not all(finding.ok for finding in findings):
+        sys.exit(1)
 
 
 def diagnose(directory: Path | None = None) -> list[Finding]:
@@ -131,6 +151,8 @@ def check_egl() -> Finding:
 
 def check_image() -> Finding:
     """Return whether a child process can render a box."""
+    from drakegrasp.vision.probe_image import probe_image
+
     ok, what = probe_image()
     missing = what.startswith("ModuleNotFoundError")
     remedy = f"pip install '{DRAKE_REQUIREMENT}' drakegrasp" if missing else EGL_PACKAGES

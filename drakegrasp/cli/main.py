@@ -1,75 +1,79 @@
-"""The command line: the group of all commands.
+"""The command line: the table of all commands.
 
 Results go to standard output, progress and errors to standard error. Exit codes: 0 done, 1 the work
-failed, 2 wrong usage. Commands import heavy libraries only when they run, so that `--help` answers
-immediately.
+failed, 2 wrong usage. A command is imported when it is used, and imports heavy libraries only when
+it runs, so that `--help` answers immediately.
 """
 
 from __future__ import annotations
 
 import io
 import sys
-from pathlib import Path
+from collections.abc import Sequence
 
-import click
+from drakegrasp.cli.console import restart_with_utf8, run_command
+from drakegrasp.cli.help import OPTIONS, new_group
 
-from drakegrasp import __version__
-from drakegrasp.cli.console import Commands, restart_with_utf8, say_finding
-from drakegrasp.cli.datasets import (
-    assemble,
-    bench_set,
-    build,
-    check,
-    merge,
-    replay,
-    scenes,
-    stats,
+#: The commands in the order of the help: functions or groups, and the first lines of their help.
+COMMANDS = {
+    "doctor": ("doctor:doctor", "Check that this machine can run drakegrasp."),
+    "objects": ("models:objects", "List or export the built-in objects, or make morphs of meshes."),
+    "audit": ("models:audit", "Check which meshes are fit, repaired or refused."),
+    "hand": ("models:hand", "List the hands, draft a hand file, or check a hand."),
+    "build": ("build:build", "Build a dataset from a directory of meshes."),
+    "submit": ("build:submit", "Build a dataset on a cluster; the command starts the workers."),
+    "assemble": ("datasets:assemble", "Filter and split again, without simulating."),
+    "merge": ("datasets:merge", "Merge several datasets that were built separately."),
+    "scenes": ("datasets:scenes", "Render views of training scenes, independent of grasps."),
+    "check": ("datasets:check", "Check every invariant of a dataset."),
+    "stats": ("datasets:stats", "Count outcomes, how well grasps hold, and samples."),
+    "inspect": ("views:inspect", "Look at grasps in a browser, and reject them."),
+    "figures": ("views:figures", "Draw a dataset: pictures as PNG and SVG, numbers as JSON."),
+    "replay": ("datasets:replay", "Run a trial again and compare every value."),
+    "predict": ("predict:predict", "Write a network's grasps for what a camera saw, best first."),
+    "verify": ("verify:verify", "Try predicted grasps in the simulator."),
+    "score": ("score:score", "Score predicted grasps against reference rows."),
+    "bench-set": ("build:bench_set", "Build the frozen benchmark drakegrasp-bench-1 in OUT."),
+    "export": ("views:export", "Write the samples of a dataset in another format."),
+}
+#: Commands that the same words continue after Ctrl-C.
+RESUMABLE = ("build", "submit", "bench-set")
+
+
+def _version() -> str:
+    from drakegrasp import __version__
+
+    return f"drakegrasp, version {__version__}"
+
+
+app = new_group(
+    "drakegrasp",
+    "Simulate multi-finger grasps of object meshes and write datasets of them.",
+    {name: summary for name, (_, summary) in COMMANDS.items()},
+    version=_version,
 )
-from drakegrasp.cli.models import audit, hand, objects
-from drakegrasp.cli.options import PATH
-from drakegrasp.cli.predict import predict
-from drakegrasp.cli.predictions import score, verify
-from drakegrasp.cli.submit import submit
-from drakegrasp.cli.views import export, figures, inspect_
+for _number, (_name, (_place, _)) in enumerate(COMMANDS.items()):
+    app.command(f"drakegrasp.cli.{_place}", name=_name, sort_key=_number)
+for _flag in ("--help", "--version"):
+    app[_flag].group = (OPTIONS,)
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="drakegrasp")
-def main() -> None:
-    """Simulate multi-finger grasps of object meshes and write datasets of them."""
+def main(words: Sequence[str] | None = None) -> None:
+    """Run a command in this process.
 
+    Args:
+        words: The command line without the name of the program; None for that of this process.
 
-@click.command()
-@click.argument("directory", type=PATH, default=Path("."))
-def doctor(directory: Path) -> None:
-    """Check that this machine can run drakegrasp.
-
-    The command reports what is missing and how to install it. DIRECTORY is the directory in which a
-    dataset would be written. The exit code is 1 if anything is missing.
+    Raises:
+        SystemExit: If the command fails.
     """
-    from drakegrasp.cli.doctor import diagnose
-
-    # One line per requirement, and a second line with the remedy if it is not met.
-    findings = diagnose(directory)
-    for finding in findings:
-        say_finding(finding.ok, "MISSING", f"{finding.name:<18} {finding.what}")
-        if not finding.ok:
-            click.echo(f"         -> {finding.remedy}")
-    if not all(finding.ok for finding in findings):
-        sys.exit(1)
-
-
-# The help lists the commands in this order.
-for _command in (
-    *(doctor, objects, audit, hand, build, submit, assemble, merge, scenes, check, stats, inspect_),
-    *(figures, replay, predict, verify, score, bench_set, export),
-):
-    main.add_command(_command)
+    words = sys.argv[1:] if words is None else words
+    run_command(app, words, resumable=words[:1] in [[name] for name in RESUMABLE])
 
 
 def run() -> None:
     """Run the program."""
-    # Click drops what is printed to a closed stream, and a file that is opened may get its number.
+    # What is printed to a closed stream is lost, and a file that is opened may get its number.
     if sys.stdout is None:
         sys.exit("error: standard output must be open, got a closed one")
     restart_with_utf8()

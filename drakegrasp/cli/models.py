@@ -5,30 +5,34 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
-from drakegrasp.cli.console import progress_bar, say, say_finding
-from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, described, shared
+import drakegrasp as dg
+from drakegrasp.cli.arguments import AnyPath, Count, File, Folder, Name, NewFile, Positive, Units
+from drakegrasp.cli.console import UsageError, progress_bar, say, say_finding
+from drakegrasp.cli.help import new_group
 from drakegrasp.errors import counted
 
 if TYPE_CHECKING:
     from drakegrasp.hand.checks import Finding
 
+objects = new_group("objects", "List or export the built-in objects, or make morphs of meshes.")
+hand = new_group("hand", "List the hands, draft a hand file, or check a hand.")
 
-@click.command()
-@described
-@click.argument("mesh_dir", type=PATH)
+
 def audit(
-    mesh_dir: Path,
-    units: str,
-    manifest: Path | None,
-    hand: str | None = None,
-    json_file: Path | None = None,
-    sheet: Path | None = None,
+    mesh_dir: Folder,
+    /,
+    *,
+    units: Units = "m",
+    manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
+    hand: Annotated[str, Parameter(metavar="NAME|YAML")] = "barrett",
+    json_file: Annotated[NewFile | None, Parameter(name="--json")] = None,
+    sheet: NewFile | None = None,
 ) -> None:
     """Check which meshes are fit, repaired or refused.
 
@@ -36,22 +40,21 @@ def audit(
     on the table, and refuses objects that do not come to rest. The exit code is 1 if every mesh is
     refused.
 
-    Options:
-        --units, --manifest
-        --hand HAND: Hand whose opening and stand-offs are compared with the objects' sizes.
-            [default: barrett]
-        --json FILE (json_file): Write all findings as JSON.
-        --sheet FILE: Write a picture of every object with its status (.png).
+    Args:
+        mesh_dir: Directory of meshes.
+        units: Unit of length of the meshes.
+        manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
+            of the meshes]
+        hand: Hand whose opening and stand-offs are compared with the objects' sizes.
+        json_file: Write all findings as JSON.
+        sheet: Write a picture of every object with its status (.png).
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
-    from drakegrasp.hand.description import load_hand
     from drakegrasp.hand.kinematics import flat_limits, opening
-    from drakegrasp.hand.settings import load_config
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import atomic_path, write_atomic
 
-    config = load_config(overrides=[f"hand={hand}"] if hand else [])
-    own = load_hand(config.hand_source)
+    own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"]).hand_source)
     limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
     with progress_bar("audit", "meshes") as progress:
         rows = audit_meshes(mesh_dir, units=units, manifest=manifest, **limits, progress=progress)
@@ -73,12 +76,7 @@ def audit(
         sys.exit(1)
 
 
-@click.group()
-def objects() -> None:
-    """List or export the built-in objects, or make morphs of meshes."""
-
-
-@objects.command("list")
+@objects.command(name="list")
 def list_objects() -> None:
     """Print every built-in class with its drawn parameters."""
     from drakegrasp.shapes.catalog import CLASSES
@@ -88,35 +86,36 @@ def list_objects() -> None:
         say(f"{item.number:>2} {item.name:<15} {sizes}")
 
 
-@objects.command("export")
-@click.argument("directory", type=PATH)
-@shared("--per-class", "--objects-seed")
-def export_objects(directory: Path, **options: Any) -> None:
+@objects.command(name="export")
+def export_objects(directory: Folder, /, *, per_class: Count = 2, objects_seed: Count = 0) -> None:
     """Write the built-in objects' meshes (.obj, metres) to DIRECTORY.
 
     The same options write the same bytes on every machine.
+
+    Args:
+        directory: Folder of the meshes.
+        per_class: Number of objects of each class.
+        objects_seed: Seed of the sizes of the objects.
     """
-    from drakegrasp.generation.request import BUILTIN
-    from drakegrasp.hand.settings import load_config
     from drakegrasp.shapes.catalog import export_builtin
 
-    config = load_config(overrides=chosen_settings({"objects": BUILTIN, **options}))
+    drawn = [f"builtin.per_class={per_class}", f"builtin.seed={objects_seed}"]
+    config = dg.load_config(overrides=drawn)
     with progress_bar("objects", "meshes") as progress:
         paths = export_builtin(directory, config=config.builtin, progress=progress)
     say(f"{counted(len(paths), 'mesh', 'meshes')} in {directory}")
 
 
-@objects.command("morph")
-@described
-@click.argument("mesh_dir", type=PATH)
-def morph(
-    mesh_dir: Path,
-    units: str,
-    manifest: Path | None,
+@objects.command(name="morph")
+def morph_objects(
+    mesh_dir: Folder,
+    /,
     *,
-    per_mesh: Annotated[int, click.IntRange(min=1)],
-    seed: Annotated[int, click.IntRange(min=0)] = 0,
-    out: Path,
+    per_mesh: Positive,
+    seed: Annotated[Count, Parameter(validator=Number(gte=0))] = 0,
+    out: Folder,
+    units: Units = "m",
+    manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
 ) -> None:
     """Create objects with other proportions from meshes.
 
@@ -124,24 +123,20 @@ def morph(
     metres, +z up) stand on the table like the mesh, and an objects.yaml in DIR keeps their classes.
     The same seed writes the same files.
 
-    Options:
-        --per-mesh N: Number of morphs of each mesh.
-        --seed S: Seed of the draws.
-        --out DIR: Directory of the morphs; new or empty.
-        --units, --manifest
+    Args:
+        mesh_dir: Directory of meshes.
+        per_mesh: Number of morphs of each mesh.
+        seed: Seed of the draws.
+        out: Directory of the morphs; new or empty.
+        units: Unit of length of the meshes.
+        manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
+            of the meshes]
     """
     from drakegrasp.objects.morph import morph_meshes
 
+    how: Any = {"per_mesh": per_mesh, "seed": seed, "units": units, "manifest": manifest}
     with progress_bar("morph", "morphs") as progress:
-        report = morph_meshes(
-            mesh_dir,
-            out,
-            per_mesh=per_mesh,
-            seed=seed,
-            units=units,
-            manifest=manifest,
-            progress=progress,
-        )
+        report = morph_meshes(mesh_dir, out, **how, progress=progress)
     for reason in report.refused:
         say(f"no morphs of {reason}", err=True)
     for name, count in report.crossing.items():
@@ -151,12 +146,7 @@ def morph(
     say(f"{counted(report.morphs, 'morph')} in {out}; {share:.0%} by the first draw")
 
 
-@click.group()
-def hand() -> None:
-    """List the hands, draft a hand file, or check a hand."""
-
-
-@hand.command("list")
+@hand.command(name="list")
 def list_hands() -> None:
     """Print the names of the hands that come with the package."""
     from drakegrasp.hand.files import hand_names
@@ -165,39 +155,38 @@ def list_hands() -> None:
         say(name)
 
 
-@hand.command("new")
-@described
-@click.argument("model", type=FILE, metavar="MODEL")
+@hand.command(name="new")
 def new_hand(
-    model: Path,
+    model: File,
+    /,
     *,
-    out: Path,
-    palm: str | None = None,
-    approach: str | None = None,
-    fingers: str | None = None,
-    joints: tuple[str, ...] = (),
-    reverse: tuple[str, ...] = (),
-    effort: Annotated[float | None, click.FloatRange(min=0.0, min_open=True)] = None,
-    settings: tuple[str, ...] = (),
-    packages: tuple[str, ...] = (),
+    out: Folder,
+    palm: Annotated[str | None, Parameter(metavar="LINK")] = None,
+    approach: Annotated[str | None, Parameter(metavar="X,Y,Z", allow_leading_hyphen=True)] = None,
+    fingers: Annotated[str | None, Parameter(metavar="LINK,LINK")] = None,
+    joints: Annotated[tuple[str, ...], Parameter(name="--joint", metavar="NAME=POSITION")] = (),
+    reverse: Annotated[tuple[str, ...], Parameter(metavar="JOINT")] = (),
+    effort: Annotated[float | None, Parameter(metavar="E", validator=Number(gt=0.0))] = None,
+    settings: Annotated[tuple[str, ...], Parameter(name="--set", metavar="KEY=VALUE")] = (),
+    packages: Annotated[tuple[str, ...], Parameter(name="--package", metavar="NAME=FOLDER")] = (),
 ) -> None:
     """Draft a hand file from a model, and draw it.
 
     MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. The command writes the hand file,
-    in which each guess has a comment, the model, its meshes and a picture to FOLDER. Options
-    override guesses. The exit code is 1 if a check of the drafted hand fails.
+    in which each guess has a comment, the model, its meshes and a picture to DIR. Options override
+    guesses. The exit code is 1 if a check of the drafted hand fails.
 
-    Options:
-        --out FOLDER: A new folder for the hand's files.
-        --palm LINK: The link from which the fingers branch.
-        --approach X,Y,Z: Direction that the palm faces: +Gz, in the axes of the palm link.
-        --fingers LINK,LINK: The fingertip links of the grasping fingers.
-        --joint NAME=POSITION (joints): The position of a joint that does not close [rad or m], as
-            in the vendor's model.
-        --reverse JOINT: A joint whose positive position opens the hand.
-        --effort E: Largest effort of each motor at its joint [N m, or N].
-        --set KEY=VALUE (settings): A key of the hand file, as in --set drive=torque.
-        --package NAME=FOLDER (packages): Folder of package://NAME/.
+    Args:
+        model: The model of the hand.
+        out: A new folder for the hand's files.
+        palm: The link from which the fingers branch.
+        approach: Direction that the palm faces: +Gz, in the axes of the palm link.
+        fingers: The fingertip links of the grasping fingers.
+        joints: The position of a joint that does not close [rad or m], as in the vendor's model.
+        reverse: A joint whose positive position opens the hand.
+        effort: Largest effort of each motor at its joint [N m, or N].
+        settings: A key of the hand file, as in --set drive=torque.
+        packages: Folder of package://NAME/.
     """
     import numpy as np
 
@@ -206,7 +195,7 @@ def new_hand(
 
     # The user's answers.
     answers = Answers(
-        approach=None if approach is None else np.array(_numbers(approach)),
+        approach=None if approach is None else np.array(_direction(approach)),
         fingers=tuple(fingers.split(",")) if fingers else (),
         joints={name: _number(text) for name, text in _pairs("--joint", joints)},
         palm=palm,
@@ -234,39 +223,39 @@ def new_hand(
         sys.exit(1)
 
 
-def _pairs(option: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+def _pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
     """Return the name and the value of each NAME=VALUE."""
-    for text in texts:
-        if not all(text.partition("=")):
-            raise click.BadParameter(f"{option} must be NAME=VALUE, got {text!r}")
-    return [(name, value) for name, _, value in (text.partition("=") for text in texts)]
+    parts = [text.partition("=") for text in texts]
+    for name, sign, value in parts:
+        if not (name and value):
+            raise UsageError(f"{option} must be NAME=VALUE, got {name + sign + value!r}")
+    return [(name, value) for name, _, value in parts]
 
 
 def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise click.BadParameter(f"must be a number, got {text!r}") from None
+        raise UsageError(f"must be a number, got {text!r}") from None
 
 
-def _numbers(text: str) -> list[float]:
+def _direction(text: str) -> list[float]:
     numbers = [_number(part) for part in text.split(",")]
     if len(numbers) != 3 or not any(numbers):
-        raise click.BadParameter(f"--approach must be X,Y,Z, not all zero, got {text!r}")
+        raise UsageError(f"--approach must be X,Y,Z, not all zero, got {text!r}")
     return numbers
 
 
-@hand.command("check")
-@described
-@click.argument("hand_file", metavar="NAME|YAML")
-def check_hand_file(hand_file: str, picture: Annotated[Path | None, NEW_FILE] = None) -> None:
+@hand.command(name="check")
+def check_hand_file(hand_file: Name, /, *, picture: NewFile | None = None) -> None:
     """Check a hand before it is used, with trial grasps.
 
-    The command checks files, motion, strength and trial grasps in simulation. NAME is a hand that
-    comes with the package, YAML is a hand file. The exit code is 1 if anything is wrong.
+    The command checks files, motion, strength and trial grasps in simulation. The exit code is 1 if
+    anything is wrong.
 
-    Options:
-        --picture PNG: Write a picture of the hand, open and closed, with pads and palm frame.
+    Args:
+        hand_file: Name of a hand that comes with the package, or a hand file (YAML).
+        picture: Write a picture of the hand, open and closed, with pads and palm frame.
     """
     from drakegrasp.hand_setup.check import check_hand
 
@@ -282,11 +271,10 @@ def check_hand_file(hand_file: str, picture: Annotated[Path | None, NEW_FILE] = 
 
 def _draw(hand_file: str | Path, picture: Path) -> None:
     """Draw a hand."""
-    from drakegrasp.hand.description import load_hand
     from drakegrasp.hand.finger_sweep import across
     from drakegrasp.pictures.rendered import picture_hand
 
-    loaded = load_hand(hand_file)
+    loaded = dg.load_hand(hand_file)
     x, y, _ = across(loaded)
     picture_hand(loaded, picture, across=math.atan2(y, x))
 

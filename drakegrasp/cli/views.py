@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from textwrap import fill
-from typing import Annotated
+from typing import Annotated, Literal
 
-import click
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from drakegrasp import registry
-from drakegrasp.cli.console import Command, progress_bar, say
-from drakegrasp.cli.options import PATH, Named, dataset_argument, described
+from drakegrasp.cli.arguments import AnyPath, Dataset, Folder, given
+from drakegrasp.cli.console import UsageError, progress_bar, say
+from drakegrasp.cli.help import new_group
 from drakegrasp.errors import counted
 
 #: Default of --port: a fixed number, so that a tunnel to another machine can stay open.
 PORT = 8321
 
 
-@click.command("inspect")
-@described
-@dataset_argument()
-def inspect_(
-    out: Path,
-    results: Path | None = None,
-    port: Annotated[int, click.IntRange(0, 65535)] = PORT,
+def inspect(
+    out: Dataset,
+    /,
+    *,
+    results: Annotated[AnyPath | None, Parameter(name="--predictions", metavar="RESULTS")] = None,
+    port: Annotated[int, Parameter(metavar="N", validator=Number(gte=0, lte=65535))] = PORT,
     no_browser: bool = False,
 ) -> None:
     """Look at grasps in a browser, and reject them.
@@ -32,11 +32,12 @@ def inspect_(
     suspicious first. Rejections are written to OUT/reject.json immediately; assemble --reject reads
     that file. The page can be reached from this machine only. Ctrl-C ends the command.
 
-    Options:
-        --predictions RESULTS (results): Show predictions next to their rows of the dataset: the
-            results that verify --dataset FILE --out NAME wrote.
-        --port N: Port on this machine; 0 selects any free port.
-        --no-browser: Only print the address.
+    Args:
+        out: Directory of the dataset.
+        results: Show predictions next to their rows of the dataset: the results that verify
+            --dataset FILE --out NAME wrote.
+        port: Port on this machine; 0 selects any free port.
+        no_browser: Only print the address.
     """
     from drakegrasp.errors import MachineError, one_line
 
@@ -52,29 +53,28 @@ def inspect_(
     serve(out, results=results, port=port, browser=not no_browser, announce=say)
 
 
-@click.command()
-@described
-@dataset_argument()
 def figures(
-    out: Path,
-    quiet: bool,
-    folder: Path | None = None,
+    out: Dataset,
+    /,
+    *,
+    folder: Annotated[Folder | None, Parameter(name="--out")] = None,
+    quiet: bool = False,
 ) -> None:
     """Draw a dataset: pictures as PNG and SVG, numbers as JSON.
 
-    \b
-    sheet          colour, depth and mask of samples of all objects in turn
-    outcomes       how the attempts ended: samples, removed, failed
-    hold           samples: how well they hold, how many are distinct
-    objects        samples of each object, and how many are distinct
-    distributions  slip, turn, forces of the samples
-    approaches     from where the palms of the samples came
-    views          views of scenes with a sample of each, if there are scenes
+        sheet          colour, depth and mask of samples of all objects in turn
+        outcomes       how the attempts ended: samples, removed, failed
+        hold           samples: how well they hold, how many are distinct
+        objects        samples of each object, and how many are distinct
+        distributions  slip, turn, forces of the samples
+        approaches     from where the palms of the samples came
+        views          views of scenes with a sample of each, if there are scenes
 
-    Options:
-        --out DIR (folder): Folder of the figures. [default: OUT/figures]
-        --quiet
-    """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+    Args:
+        out: Directory of the dataset.
+        folder: Folder of the figures. [default: OUT/figures]
+        quiet: Show no progress.
+    """
     from drakegrasp.foreign_files import refuse_link
     from drakegrasp.pictures.figures import write_figures
 
@@ -88,54 +88,48 @@ def figures(
     say(f"{counted(len(written.names), 'figure')} in {written.folder}")
 
 
-class _Export(Command):
-    """The command `export`, whose help lists the exporters."""
-
-    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the text, and a paragraph with the formats; called by click."""
-        super().format_help_text(ctx, formatter)
-        formatter.write_paragraph()
-        for name in registry.names("exporters"):
-            row = f"  {name:<15}{registry.summary('exporters', name)}"
-            formatter.write(f"{fill(row, 79, subsequent_indent=' ' * 17)}\n")
+def _formats() -> str:
+    """Return a line or more on each format."""
+    names = registry.names("exporters")
+    rows = (f"  {name:<15}{registry.summary('exporters', name)}" for name in names)
+    return "Formats:\n" + "\n".join(fill(row, 79, subsequent_indent=" " * 17) for row in rows)
 
 
-@click.command(cls=_Export)
-@described
-@dataset_argument()
-@click.argument("directory", type=PATH, required=False)
-def export(
-    out: Path,
-    directory: Path | None,
-    quiet: bool,
+export = new_group("export", None, help_epilogue=_formats())
+
+
+@export.default
+def export_samples(
+    out: Dataset,
+    directory: Folder | None = None,
+    /,
     *,
-    form: Annotated[str, Named("exporters")],
-    licence: str | None = None,
-    attempts: Annotated[str | None, click.Choice(["samples", "failed", "all"])] = None,
-    fps: Annotated[int | None, click.IntRange(1, 120)] = None,
+    form: Annotated[str, Parameter(name="--to", metavar="FORMAT")],
+    licence: Annotated[str | None, Parameter(name=("--licence", "--license"), metavar="ID")] = None,
+    attempts: Literal["samples", "failed", "all"] | None = None,
+    fps: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1, lte=120))] = None,
+    quiet: bool = False,
 ) -> None:
     """Write the samples of a dataset in another format.
 
-    DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
-
-    Options:
-        --to (form): The format.
-        --licence --license ID: Licence that the card of format hf names, e.g. cc-by-4.0.
-        --attempts WHICH: Attempts of format lerobot: samples; failed: the hand closed, but does
-            not hold the object; all: samples, failed and held attempts.  [default: samples]
-        --fps N: Frames per second of format lerobot.  [default: 10]
-        --quiet
+    Args:
+        out: Directory of the dataset.
+        directory: New or empty folder. [default: OUT/export_FORMAT]
+        form: The format, see below.
+        licence: Licence that the card of format hf names, e.g. cc-by-4.0.
+        attempts: Attempts of format lerobot: samples; failed: the hand closed, but does not hold
+            the object; all: samples, failed and held attempts. [default: samples]
+        fps: Frames per second of format lerobot. [default: 10]
+        quiet: Show no progress.
     """
     from drakegrasp.exchange.export import export_dataset, options_of
     from drakegrasp.foreign_files import refuse_link
 
     # What only some formats take.
-    known = options_of(form)
-    given = {"licence": licence, "attempts": attempts, "fps": fps}
-    options = {name: value for name, value in given.items() if value}
+    options = given(licence=licence, attempts=attempts, fps=fps)
     for name, value in options.items():
-        if name not in known:
-            raise click.UsageError(f"--{name} must be left out with --to {form}, got {value}")
+        if name not in options_of(form):
+            raise UsageError(f"--{name} must be left out with --to {form}, got {value}")
 
     if directory is None:
         directory = out / f"export_{form}"

@@ -1,48 +1,15 @@
-"""The request for a build, and the part of its work units that a job builds."""
+"""What a build is asked for: names of objects, and the part of its work units of a job."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from drakegrasp.errors import ConfigError, MeshError, listed
 
-if TYPE_CHECKING:
-    from drakegrasp.config import Config
-
-
 #: Name that requests the built-in objects instead of a directory of meshes.
 BUILTIN = "builtin"
-
-
-@dataclass(frozen=True, kw_only=True)
-class BuildRequest:
-    """What to build; the workers are specified elsewhere.
-
-    Attributes:
-        objects: Directory of meshes, or "builtin".
-        out: Directory of the dataset.
-        config: Configuration of the dataset.
-        units: Unit of length of the meshes.
-        manifest: YAML file with units and classes by mesh.
-        only: Names of the objects to build; all if empty.
-        postures: File of postures that are tried instead of drawn palm poses.
-        show: Whether to show progress on standard error.
-        read_as: Values for all postures, see `exchange.attempts.read_attempts`.
-    """
-
-    objects: str
-    out: Path
-    config: Config
-    units: str
-    manifest: Path | None
-    only: tuple[str, ...]
-    postures: Path | None
-    show: bool
-    read_as: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

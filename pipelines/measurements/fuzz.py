@@ -198,7 +198,11 @@ def load(out: Path) -> None:
 def say(*words: str) -> Reader:
     """Return a reader that runs a command of drakegrasp on the folder."""
     name, *options = words
-    return lambda folder: command.main([name, str(folder), *options], prog_name="drakegrasp")
+
+    def read(folder: Path) -> None:
+        command([name, str(folder), *options])
+
+    return read
 
 
 def check_hand(folder: Path) -> None:

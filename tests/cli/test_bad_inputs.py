@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 import uvicorn
 import yaml
-from click.testing import CliRunner, Result
 from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
 from helpers.bad_inputs.kinds import Kind, Workplace
+from helpers.commands import Result
+from helpers.commands import run as run_command
 from helpers.datasets import OTM, OTO, REPEATED, TRIALS, make_dataset
 from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
-from drakegrasp.cli.main import main
 from drakegrasp.hand.files import MODELS
 from drakegrasp.page.attempts import Attempts
 
@@ -108,9 +108,9 @@ def run(command: Sequence[str], **places: object) -> Result:
     signal.setitimer(signal.ITIMER_PROF, PATIENCE)
     signal.setitimer(signal.ITIMER_REAL, LONG_PATIENCE)
     try:
-        return CliRunner().invoke(main, words)
+        return run_command(*words)
     except TookTooLongError as error:
-        return Result(CliRunner(), b"", b"", b"", None, 99, error, (type(error), error, None))
+        return Result(exit_code=99, stdout="", stderr="", exception=error)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -125,7 +125,7 @@ def wrong_answer(result: Result, names: Sequence[str]) -> str | None:
         result: Of the command.
         names: What the line must name one of.
     """
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
+    if result.exception is not None:
         frames = traceback.extract_tb(result.exception.__traceback__)
         own = [f for f in frames if "/drakegrasp/" in f.filename and "/tests/" not in f.filename]
         at = f"{Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
@@ -442,7 +442,7 @@ def test_options_of_a_cluster(base: Path, tmp_path: Path, option: str) -> None:
         words = ["--objects", str(base / "meshes"), "--out", str(tmp_path / "out"), "--dry-run"]
         words += ["--cluster", "slurm", "--host", "10.0.0.1"]
         words += [] if option == "--workers" else ["--workers", "2"]
-        result = CliRunner().invoke(script, [*words, option, value])
+        result = run_command(*words, option, value, command=script)
         answer = wrong_answer(result, (option, option[2:], "workers"))
         if answer is not None:
             wrong[value] = answer

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from click.testing import Result
-from helpers.commands import error_line, run
+from helpers.commands import Result, error_line, run
 from helpers.datasets import OTM, OTO, make_dataset
 
 from drakegrasp.dataset.manifest import read_manifest

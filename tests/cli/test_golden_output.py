@@ -7,42 +7,37 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import click
 import pytest
 import trimesh
-from helpers.commands import run
+from cyclopts.annotations import get_hint_name
+from helpers.commands import arguments_of, run
 from helpers.datasets import SLIPPED, end_lift
 from helpers.golden import Golden
 from rich.console import Console
 from rich.table import Table
 
-from drakegrasp.cli.main import main
+from drakegrasp.cli.main import COMMANDS, app
 from drakegrasp.cli.tables import score_table, verdict_table
 from drakegrasp.outcomes import Outcome
 
 
-def options_of(name: str, command: click.Command) -> list[str]:
-    """Return a line for each parameter of a command and of its own commands."""
+def options_of(name: str) -> list[str]:
+    """Return a line for each argument of a command, or of the commands of a group."""
+    below = app[name]
+    commands = [[name, each] for each in below if not each.startswith("-")] or [[name]]
     lines = []
-    for option in command.params:
-        kind, default = option.type, option.default
-        bounded = isinstance(kind, click.Choice | click.IntRange | click.FloatRange)
-        words = [name, "/".join([*option.opts, *option.secondary_opts])]
-        words.append(repr(kind) if bounded else kind.name)
-        words += [str(default)] if isinstance(default, bool | int | float | str) else []
-        words += [flag for flag in ("required", "multiple", "is_flag") if vars(option).get(flag)]
-        lines.append(" ".join(words))
-    if isinstance(command, click.Group):
-        context = click.Context(command)
-        for own in command.list_commands(context):
-            found = command.get_command(context, own)
-            assert found is not None
-            lines += options_of(f"{name} {own}".strip(), found)
+    for command in commands:
+        for option in arguments_of(*command):
+            choices, default = option.get_choices() or (), option.field_info.default
+            words = [*command, "/".join(option.names), get_hint_name(option.hint), *choices]
+            told = isinstance(default, bool | int | float | str)
+            words += [str(default)] * told + ["required"] * option.required
+            lines.append(" ".join(words))
     return lines
 
 
 def test_options(golden: Golden) -> None:
-    golden("commands/options", "\n".join(options_of("", main)))
+    golden("commands/options", "\n".join(line for name in COMMANDS for line in options_of(name)))
 
 
 @pytest.mark.parametrize(

@@ -21,18 +21,16 @@ except BaseException:
 """
 COMMAND = """
 import sys, time
-import click
-from drakegrasp.cli.console import OneCommand
+from drakegrasp.cli.console import run_command
 
-@click.command(cls=OneCommand)
-def command():
+def command(words, **_):
     import greedy
     print(f"whole: {greedy.whole}", flush=True)
     time.sleep(20.0)
     print("went on")
 
 sys.path.insert(0, sys.argv.pop())
-command()
+run_command(command, [], resumable=True)
 """
 
 

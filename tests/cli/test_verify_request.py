@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,8 +13,7 @@ from helpers.commands import run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
-from drakegrasp.cli.options import VerifyRequest
-from drakegrasp.cli.placing import place_requested
+from drakegrasp.cli.verify import Target, place
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError, HandError
@@ -34,8 +34,9 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(folder / "out", folder, overrides=[*DRAWN, "split.by=class"])
 
 
-def request(out: Path, **options: object) -> VerifyRequest:
-    return VerifyRequest(**{"grasps": out / OTO, "method": "forces", **options})
+def placed(out: Path, grasps: Path | None = None, **options: Any) -> Any:
+    """Return the grasps of a file, or a dataset's own, as options place them."""
+    return place(grasps or out / OTO, Target(**{"method": "forces", **options}))
 
 
 @pytest.mark.parametrize("overrides", [(), ("verify.max_tries=1",)])
@@ -43,7 +44,7 @@ def test_rows_are_tried_with_their_own_friction_and_mass(
     drawn: Path, overrides: tuple[str, ...]
 ) -> None:
     data = GraspDataset(drawn / OTO, split="test")
-    grasps, config, _ = place_requested(request(drawn, overrides=overrides))
+    grasps, config, _ = placed(drawn, overrides=overrides)
     assert len(grasps) == len(data) > 0
     for grasp in grasps:
         row = data[grasp.index]
@@ -59,7 +60,7 @@ def test_rows_are_tried_with_their_own_friction_and_mass(
 
 def test_a_value_that_is_set_wins_over_the_drawn_one(drawn: Path) -> None:
     data = GraspDataset(drawn / OTO, split="test")
-    grasps, _, _ = place_requested(request(drawn, overrides=("physics.friction_hand=0.9",)))
+    grasps, _, _ = placed(drawn, overrides=("physics.friction_hand=0.9",))
     for grasp in grasps:
         assert grasp.config.physics.friction_hand == 0.9
         assert grasp.placed.model.friction is None  # which would win
@@ -69,7 +70,7 @@ def test_a_value_that_is_set_wins_over_the_drawn_one(drawn: Path) -> None:
 
 
 def test_a_given_configuration_draws_nothing(drawn: Path) -> None:
-    grasps, config, _ = place_requested(request(drawn, config="paper"))
+    grasps, config, _ = placed(drawn, config="paper")
     assert config == load_config("paper")
     assert {grasp.config for grasp in grasps} == {config}
     masses = [e.mass for e in read_manifest(drawn).objects]
@@ -90,8 +91,7 @@ def test_postures_of_rows_are_tried_with_the_friction_and_mass_of_their_rows(
     data = GraspDataset(drawn / OTO, split="train")
     rows = np.arange(len(data))[::-1]
     path = posture_file(tmp_path / "p.npz", data, row=rows)
-    given = VerifyRequest(grasps=path, dataset=drawn / OTO, split="train")
-    grasps, _, told = place_requested(given)
+    grasps, _, told = place(path, Target(dataset=drawn / OTO, split="train"))
     assert sorted(grasp.index for grasp in grasps) == list(range(len(data)))
     for grasp in grasps:
         row = data[int(rows[grasp.index])]
@@ -110,7 +110,7 @@ def test_postures_without_rows_are_tried_on_the_objects_that_they_name(
     data = GraspDataset(drawn / OTO, split="train")
     names = ["cup", *data.column("object_props/object_name")[1:]]
     path = posture_file(tmp_path / "p.npz", data, object=names)
-    grasps, _, _ = place_requested(VerifyRequest(grasps=path, dataset=drawn / OTO))
+    grasps, _, _ = place(path, Target(dataset=drawn / OTO))
     found = {grasp.index: grasp for grasp in grasps}
     assert [found[i].placed.model.name for i in range(len(data))] == names
     assert found[0].invalid.startswith("object must be one of 1_box_a, 2_box_b, 3_brick, got 'cup'")
@@ -132,12 +132,12 @@ def test_postures_of_a_mesh_are_those_that_name_it(
     trimesh.creation.box([0.06] * 3).export(tmp_path / "box.obj")
     q, X = np.zeros((len(names), len(load_hand().joint_names))), [np.eye(4)] * len(names)
     np.savez(tmp_path / "p.npz", X_FG=X, q_grasp=q, object=names)
-    given = VerifyRequest(grasps=tmp_path / "p.npz", mesh=tmp_path / "box.obj")
+    given = (tmp_path / "p.npz", Target(mesh=tmp_path / "box.obj"))
     if not count:
         with pytest.raises(GraspError, match=words):
-            place_requested(given)
+            place(*given)
         return
-    grasps, _, _ = place_requested(given)
+    grasps, _, _ = place(*given)
     assert [grasp.index for grasp in grasps] == list(range(count))
     told = capsys.readouterr().err
     assert words in told and f"{count} of {count} rows of the postures name no resting" in told
@@ -149,7 +149,7 @@ def test_postures_of_a_mesh_are_those_that_name_it(
         ({"frame": "camera"}, "--frame must be left out with postures, got camera"),
         ({"method": "forces"}, "--method must be left out with postures, got forces"),
         ({"hand": "allegro"}, "--hand must be left out with postures and --dataset, got allegro"),
-        ({"mesh": Path("a.obj")}, "--object MESH or --dataset FILE must be given with postures"),
+        ({"mesh": Path("a.obj")}, "--object or --dataset must be given, got both"),
     ],
 )
 def test_options_that_postures_answer_are_refused(
@@ -157,7 +157,7 @@ def test_options_that_postures_answer_are_refused(
 ) -> None:
     path = posture_file(tmp_path / "p.npz", GraspDataset(drawn / OTO, split="train"))
     with pytest.raises(GraspError, match=words):
-        place_requested(VerifyRequest(**{"grasps": path, "dataset": drawn / OTO, **options}))  # type: ignore[arg-type]
+        place(path, Target(**{"dataset": drawn / OTO, **options}))  # type: ignore[arg-type]
 
 
 def test_a_hand_whose_files_have_changed_is_refused_unless_it_is_named(
@@ -172,14 +172,14 @@ def test_a_hand_whose_files_have_changed_is_refused_unless_it_is_named(
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=[f"hand={hand.name}"])
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    grasps, used, _ = place_requested(request(out))
+    grasps, used, _ = placed(out)
     assert grasps and used.hand == str(hand)
 
     # A change since then.
     hand.write_text(f"{hand.read_text()}\n# changed\n")
     with pytest.raises(HandError, match="files of the hand must be those of the dataset"):
-        place_requested(request(out))
-    grasps, used, _ = place_requested(request(out, hand=f"../{hand.name}"))
+        placed(out)
+    grasps, used, _ = placed(out, hand=f"../{hand.name}")
     assert grasps and load_hand(used.hand).name == "optional"
 
 
@@ -198,12 +198,11 @@ def test_grasps_of_others_are_tried_on_rows_that_leave_fingers_out(tmp_path: Pat
         file["test/grasp_props/unused"][:] = 0b001
         predicted = file["test/grasps"][:]
     np.save(tmp_path / "predicted.npy", predicted)
-    grasps, _, _ = place_requested(
-        request(out, grasps=tmp_path / "predicted.npy", dataset=out / OTO, split="test")
-    )
+    given = {"dataset": out / OTO, "split": "test"}
+    grasps, _, _ = placed(out, tmp_path / "predicted.npy", **given)
     assert len(grasps) == len(predicted) > 0
     with pytest.raises(GraspError, match="test must have contacts of all fingers, got "):
-        place_requested(request(out, split="test"))
+        placed(out, split="test")
 
 
 def test_the_rows_of_an_array_are_those_of_the_option(drawn: Path, tmp_path: Path) -> None:
@@ -212,11 +211,10 @@ def test_the_rows_of_an_array_are_those_of_the_option(drawn: Path, tmp_path: Pat
     np.save(path, data.column("grasps")[[2, 0, 1]])
     given = {"grasps": path, "dataset": drawn / OTO}
     with pytest.raises(GraspError, match=r"a grasp for each of the .*, got 3 grasps .*--rows"):
-        place_requested(request(drawn, **given))
+        placed(drawn, **given)
     np.save(tmp_path / "rows.npy", [2, 0, 1])
     for rows in ("2,0-1", str(tmp_path / "rows.npy")):
-        asked = request(drawn, **given, rows=rows)
-        grasps, _, stated = place_requested(asked)
+        grasps, _, stated = placed(drawn, **given, rows=rows)
         masses = {grasp.index: grasp.placed.model.mass for grasp in grasps}
         true = data.column("object_props/work2mass")[[2, 0, 1], 0]
         assert [masses[i] for i in range(3)] == pytest.approx(true.tolist())
@@ -224,13 +222,10 @@ def test_the_rows_of_an_array_are_those_of_the_option(drawn: Path, tmp_path: Pat
         assert stated.row.tolist() == [2, 0, 1]
     for rows in ("2,0", "2,x,1", "-1", "1-", "0-99999999999"):
         with pytest.raises(GraspError, match="rows must be"):
-            place_requested(request(drawn, **given, rows=rows))
+            placed(drawn, **given, rows=rows)
 
 
-def test_the_frame_of_the_table_has_one_name_and_its_earlier_one_is_read(tmp_path: Path) -> None:
+def test_an_unknown_frame_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     np.save(tmp_path / "g.npy", np.zeros((1, 18)))
-    given = (tmp_path / "g.npy", "--object", tmp_path / "none.obj", "--frame")
-    told = [run("verify", *given, frame).stderr for frame in ("table", "workspace", "world")]
-    assert told[0] == told[1]
-    assert "none.obj" in told[0]
-    assert "is not one of 'object', 'camera', 'table'" in told[2]
+    told = run("verify", tmp_path / "g.npy", "--object", tmp_path / "none.obj", "--frame", "world")
+    assert 'Choose from: "object", "camera", "table", "mesh".' in told.stderr

@@ -9,15 +9,15 @@ import sys
 from itertools import pairwise, product
 from pathlib import Path
 
-import click
 import dask
 import pytest
 import trimesh
-from click.testing import CliRunner
+from cyclopts.argument import Argument
+from helpers.commands import arguments_of, run
 from helpers.golden import Golden
 from helpers.tiers import few
 
-from drakegrasp.cli.submit import submit
+from drakegrasp.cli.arguments import refuse_missing, refuse_no_file
 from drakegrasp.cluster.connect import dask_settings
 from drakegrasp.cluster.kinds import cluster_of, describe
 from drakegrasp.errors import ConfigError, MachineError
@@ -65,15 +65,15 @@ TAKEN = {"--objects", "--out", "--script", "--manifest", "--postures", "--link",
 TAKEN |= {"--interface", "--host"}
 
 
-def typed(option: click.Option, text: str, folder: Path) -> str:
+def typed(option: Argument, text: str, folder: Path) -> str:
     """Return a value of an option with a text in it; a file or a folder is made."""
     path = folder / text
-    if option.opts[0] == "--objects":
+    if option.name == "--objects":
         path.mkdir()
         trimesh.creation.box([0.06, 0.06, 0.06]).export(path / "1_box_a.obj")
-    elif not isinstance(option.type, click.Path):
-        return f"queue={text}" if option.opts[0] == "--with" else text
-    elif option.type.exists:
+    elif not option.parameter.converter:  # no path
+        return f"queue={text}" if option.name == "--with" else text
+    elif {refuse_missing, refuse_no_file} & {*option.parameter.validator}:
         path.write_text("{}")
     return str(path)
 
@@ -103,10 +103,11 @@ def test_nothing_that_is_typed_runs(
     monkeypatch.setenv("PATH", str(programs), prepend=":")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "key.pem").touch()
-    options = [o for o in submit.params if isinstance(o, click.Option) and not o.is_flag]
+    found = arguments_of("submit")
+    options = [each for each in found if each.name.startswith("--") and each.hint is not bool]
     taken = list[str]()
     for number, (option, text) in enumerate(product(options, HOSTILE)):
-        name, folder = option.opts[0], tmp_path / str(number)
+        name, folder = option.name, tmp_path / str(number)
         folder.mkdir()
         given = {"--cluster": kind, "--workers": "2", "--objects": "builtin"}
         given |= {"--with": NEEDED[kind]} if kind in NEEDED else {}
@@ -114,8 +115,7 @@ def test_nothing_that_is_typed_runs(
         given |= dict.fromkeys(TLS, "key.pem") if name in TLS else {}
         given[name] = typed(option, text, folder)
         words = [word for pair in given.items() for word in pair]
-        monkeypatch.setattr(sys, "argv", ["drakegrasp", "submit", *words])
-        result = CliRunner().invoke(submit, words)
+        result = run("submit", *words)
         if result.exit_code:
             (line,) = result.stderr.splitlines()
             assert line.startswith("error: "), (name, text)

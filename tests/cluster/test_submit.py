@@ -17,11 +17,12 @@ from typing import Any
 import dask
 import psutil
 import pytest
-from click.testing import CliRunner, Result
 from distributed import Client, rpc
 from distributed.security import Security
 from helpers import commands
 from helpers.assertions import assert_same_dataset
+from helpers.commands import Result
+from helpers.commands import run as run_command
 from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
 
@@ -54,7 +55,7 @@ def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(load_script("submit_build").main, [str(a) for a in arguments])
+    return run_command(*arguments, command=load_script("submit_build").main)
 
 
 def dry_run(out: Path, *arguments: str | Path) -> Result:
@@ -176,13 +177,13 @@ def test_keys_are_private_and_removed(tmp_path: Path) -> None:
 
 def test_script_makes_certificates_in_a_new_folder_of_its_own(tmp_path: Path) -> None:
     arguments = [str(tmp_path / "keys")]
-    result = CliRunner().invoke(load_script("make_certificates").main, arguments)
+    result = run_command(*arguments, command=load_script("make_certificates").main)
     assert result.exit_code == 0, result.output
     assert stat.S_IMODE((tmp_path / "keys").stat().st_mode) == 0o700
     files = [Path(line) for line in result.stdout.splitlines()]
     assert [path.name for path in files] == ["ca.pem", "cert.pem", "key.pem"]
     assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
-    again = CliRunner().invoke(load_script("make_certificates").main, arguments)
+    again = run_command(*arguments, command=load_script("make_certificates").main)
     assert again.exit_code == 1
     (line,) = again.stderr.splitlines()
     assert "keys: must be a folder that can be made: " in line

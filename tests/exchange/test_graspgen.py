@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from helpers.datasets import OTO
 
-from drakegrasp.cli.options import VerifyRequest
-from drakegrasp.cli.placing import place_requested
+from drakegrasp.cli.verify import Target, place
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange.attempts import has_rows, holds_postures, read_attempts
@@ -136,19 +135,19 @@ def test_a_verdict_ranks_by_object_and_by_row(out: Path, tmp_path: Path) -> None
     names = data.column("object_props/object_name").tolist()
     thing = {"file": f"{names[0]}.obj", "scale": 1}
     path = write_json(tmp_path / "a.json", object=thing)
-    where = {"grasps": path, "dataset": out / OTO, "frame": "object", "link": "palm"}
-    placed, _, rows = place_requested(VerifyRequest(**where))
+    where: dict[str, Any] = {"dataset": out / OTO, "frame": "object", "link": "palm"}
+    placed, _, rows = place(path, Target(**where))
     assert rows is None
     assert [grasp.rank for grasp in placed] == [1, 0]
 
     # A mesh of half the size is another object.
     write_json(path, object=thing | {"scale": 0.5})
     with pytest.raises(GraspError, match=rf"a\.json: scale must be that of {names[0]}, .*got 0.5"):
-        place_requested(VerifyRequest(**where))
+        place(path, Target(**where))
     write_json(path, object=thing)
 
     # As a score has them: both grasps on each row of their object.
-    placed, _, rows = place_requested(VerifyRequest(**where, split="train"))
+    placed, _, rows = place(path, Target(**where, split="train"))
     assert rows is not None
     own = [row for row, name in enumerate(names) if name == names[0]]
     assert rows.row.tolist() == own * 2

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
+from helpers.commands import run
 from helpers.machine import needs_egl
 from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_model
 
-from drakegrasp.cli.main import main
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.draft.fingers import Answers
@@ -305,8 +304,8 @@ def test_a_folder_with_files_is_not_written_over(tmp_path: Path) -> None:
 def test_a_drafted_gripper_passes_every_check(tmp_path: Path) -> None:
     """Two commands, and no answer."""
     path, out = write_model(tmp_path, JAWS, "jaws.urdf"), tmp_path / "out"
-    result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
+    result = run("hand", "new", str(path), "--out", str(out))
     assert result.exit_code == 0, result.output
     assert (out / "jaws_hand.png").read_bytes().startswith(b"\x89PNG")
-    result = CliRunner().invoke(main, ["hand", "check", str(out / "jaws_hand.yaml")])
+    result = run("hand", "check", str(out / "jaws_hand.yaml"))
     assert result.exit_code == 0, result.output

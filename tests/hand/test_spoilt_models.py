@@ -8,10 +8,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from helpers.commands import run
 from helpers.vendors import JAWS, JAWS_MJCF, fixed, link, write_model
 
-from drakegrasp.cli.main import main
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.source import read_model
@@ -149,7 +148,7 @@ def test_a_spoilt_model_is_refused_in_one_line(tmp_path: Path, fault: str) -> No
     (tmp_path / "tip.gltf").write_text("{}")
     (tmp_path / "jaw.step").write_text("ISO-10303-21;")
     out = tmp_path / "out"
-    result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
+    result = run("hand", "new", str(path), "--out", str(out))
     assert result.exit_code == 2, result.output
     assert len(result.output.strip().splitlines()) == 1, result.output
     assert re.search(message, result.output), result.output

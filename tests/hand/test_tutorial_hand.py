@@ -6,12 +6,11 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from helpers.commands import run
 from helpers.hands import PAGE as PATH
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 
-from drakegrasp.cli.main import main
 from drakegrasp.hand.file_format import Coupling, Finger, HandFile, Palm, Spread
 from drakegrasp.hand_setup import check as trial_grasps
 
@@ -29,7 +28,7 @@ def tongs(tmp_path: Path) -> Path:
 @needs_egl
 def test_the_tutorial_hand_passes_every_check_of_the_page(tongs: Path) -> None:
     picture = tongs.parent / "tongs.png"
-    result = CliRunner().invoke(main, ["hand", "check", str(tongs), "--picture", str(picture)])
+    result = run("hand", "check", str(tongs), "--picture", str(picture))
     assert result.exit_code == 0, result.output
     lines = [line.split(None, 1)[1] for line in result.output.splitlines()[:-1]]
     assert lines[0] == "files                2 fingers, 4 joints, 5 shapes in tongs.urdf"
@@ -44,7 +43,7 @@ GRASPS = [f"{shape}, {line}" for shape, line in trial_grasps.GRASPS]
 
 def test_a_fault_ends_the_command_with_one(tongs: Path) -> None:
     tongs.write_text(tongs.read_text().replace("left_tip ", "left_nail "))
-    result = CliRunner().invoke(main, ["hand", "check", str(tongs)])
+    result = run("hand", "check", str(tongs))
     assert result.exit_code == 1
     assert result.output.startswith("FAIL  files")
 

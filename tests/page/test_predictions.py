@@ -16,8 +16,7 @@ from helpers.pages import Tags
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
-from drakegrasp.cli.options import VerifyRequest
-from drakegrasp.cli.placing import place_requested
+from drakegrasp.cli.verify import Target, place
 from drakegrasp.dataset.reader import GraspDataset, read_predicted_rows
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
@@ -207,8 +206,7 @@ def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> Non
         (tmp_path / "p.h5", "train", rows),
         (data.path, "train", np.arange(len(data))),
     ):
-        request = VerifyRequest(grasps=path, dataset=data.path, split=split)
-        _, _, asked = place_requested(request)
+        _, _, asked = place(path, Target(dataset=data.path, split=split))
         assert asked is not None
         with h5py.File(tmp_path / "r.h5", "w") as file:
             asked.write(file)

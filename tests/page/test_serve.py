@@ -13,10 +13,9 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from helpers.commands import run
 from helpers.datasets import TRIALS
 
-from drakegrasp.cli.main import main
 from drakegrasp.page.app import ASSETS
 from drakegrasp.page.serve import LOOPBACK, listen
 
@@ -38,13 +37,13 @@ def test_a_taken_port_is_one_line(boxes: Path) -> None:
         other.bind((LOOPBACK, 0))
         other.listen()
         port = str(other.getsockname()[1])
-        result = CliRunner().invoke(main, ["inspect", str(boxes), "--port", port, "--no-browser"])
+        result = run("inspect", str(boxes), "--port", port, "--no-browser")
     assert result.exit_code == 1
     assert result.stderr.startswith(f"error: --port must be free on this machine, got {port}")
 
 
 def test_a_directory_without_a_dataset_is_one_line(tmp_path: Path) -> None:
-    result = CliRunner().invoke(main, ["inspect", str(tmp_path / "none")])
+    result = run("inspect", str(tmp_path / "none"))
     assert result.exit_code == 1
     assert result.stderr.startswith("error: ")
     assert "must be the directory of a dataset" in result.stderr
@@ -53,7 +52,7 @@ def test_a_directory_without_a_dataset_is_one_line(tmp_path: Path) -> None:
 
 def test_a_build_that_has_not_ended_is_one_line_that_says_how_to_end_it(out: Path) -> None:
     (out / TRIALS).unlink()
-    result = CliRunner().invoke(main, ["inspect", str(out)])
+    result = run("inspect", str(out))
     assert result.exit_code == 1
     (line,) = result.stderr.splitlines()
     assert line == (
@@ -73,7 +72,7 @@ def test_missing_extra_is_one_line(
             monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.setattr("socket.socket.listen", None)  # else a mistake would serve for ever
-    result = CliRunner().invoke(main, ["inspect", str(boxes), "--no-browser"])
+    result = run("inspect", str(boxes), "--no-browser")
     assert result.exit_code == 1
     (line,) = result.stderr.splitlines()
     assert line.startswith("error: inspect needs its packages: pip install 'drakegrasp[inspect]' (")

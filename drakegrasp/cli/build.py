@@ -1,0 +1,187 @@
+"""The commands that simulate: `build`, `submit`, which also starts the workers, and `bench-set`."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+import drakegrasp as dg
+from drakegrasp.cli.arguments import AnyPath, Count, Folder, NewFile, Settings, Tls, What, Workers
+from drakegrasp.cli.console import UsageError, same_command, say
+from drakegrasp.cli.help import MORE
+from drakegrasp.errors import counted
+
+if TYPE_CHECKING:
+    from drakegrasp.cluster.kinds import Local
+    from drakegrasp.generation.pipeline import BuildReport
+
+
+def build(
+    *,
+    what: What,
+    dry_run: bool = False,
+    part: Annotated[str | None, Parameter(group=MORE, metavar="I/N")] = None,
+    workers: Workers = Workers(),
+) -> None:
+    """Build a dataset from a directory of meshes.
+
+    The command simulates grasps of every object and writes trials.hdf5, grasping_oto.hdf5 and
+    grasping_otm.hdf5 to DIR.
+
+    Args:
+        dry_run: Only print the amount of work that is known before the build.
+        part: Only run every Nth work unit, starting with the Ith; `merge` joins the datasets of all
+            N parts.
+    """
+    asked, on = what.asked(), workers.asked()
+    if dry_run:
+        from drakegrasp.api.building import known_work
+
+        say("\n".join(known_work(**asked, part=part)))
+        return
+    print_report(dg.build_dataset(**asked, **on, out=what.out, part=part, show=not what.quiet))
+
+
+def submit(
+    *,
+    kind: Annotated[str, Parameter(name="--cluster", metavar="KIND")] = "local",
+    scheduler: Annotated[str | None, Parameter(metavar="ADDRESS")] = None,
+    scheduler_file: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
+    workers: Count | None = None,
+    cores: Count | None = None,
+    memory: Annotated[str | None, Parameter(metavar="SIZE")] = None,
+    walltime: Annotated[str | None, Parameter(metavar="TIME")] = None,
+    interface: Annotated[str | None, Parameter(metavar="NAME")] = None,
+    host: Annotated[str | None, Parameter(metavar="ADDRESS")] = None,
+    own: Annotated[tuple[str, ...], Parameter(name="--with", metavar="KEY=VALUE")] = (),
+    what: What,
+    dry_run: bool = False,
+    script: NewFile | None = None,
+    tls: Tls = Tls(),
+) -> None:
+    """Build a dataset on a cluster; the command starts the workers.
+
+        drakegrasp submit --cluster local OPTIONS
+        drakegrasp submit --cluster slurm --workers 200 --interface ib0 OPTIONS
+        drakegrasp submit --scheduler tls://10.0.0.1:8786 OPTIONS
+
+    The command first prints which workers it will use. The same command continues an interrupted
+    build, on any cluster. See docs/how-to/clusters.md for the details and pipelines/recipes/ for an
+    example of each.
+
+    Args:
+        kind: Where the work runs: local, slurm, pbs, lsf, sge, htcondor, oar, or a kind of another
+            package.
+        scheduler: In place of --cluster: use the running Dask scheduler at this address.
+        scheduler_file: In place of --cluster: use the running Dask scheduler that wrote this file.
+        workers: Total number of processes. [default with local: one per core]
+        cores: Number of cores of each job, with a worker on each core.
+        memory: Memory of each worker, e.g. 2GB.
+        walltime: Time limit of each job, as the batch scheduler writes it.
+        interface: Network interface on which scheduler and workers listen.
+        host: In place of --interface: address on which the scheduler listens.
+        own: A setting that only this kind of cluster has, e.g. queue=long; may be given several
+            times.
+        dry_run: Only print which workers would run, the amount of work that is known before the
+            build, and the script of a job.
+        script: Only write the script of a job.
+    """
+    from drakegrasp.api.building import known_work
+    from drakegrasp.cluster.kinds import Running, cluster_of, describe, present
+
+    options: dict[str, Any] = dict(workers=workers, cores=cores, memory=memory, walltime=walltime)
+    options |= dict(interface=interface, host=host)
+    asked, certificates = what.asked(), tls.asked()
+    if scheduler is not None or scheduler_file is not None:
+        if kind != "local":
+            raise UsageError("--scheduler must be used without --cluster")
+        running = Running(address=scheduler, file=scheduler_file, **options, **certificates)
+        cluster: Local = running
+    else:
+        cluster = cluster_of(kind, own, **options, **certificates)
+
+    # Print what will run before anything starts.
+    out, show = what.out.absolute(), not what.quiet
+    say("\n".join(describe(cluster)))
+    if dry_run:
+        say("\n".join(known_work(**asked)))
+    if dry_run or script is not None:
+        _give_script(cluster, out, script)
+        return
+    joint = present(cluster.connected(out), show)
+    print_report(dg.build_dataset(**asked, out=out, cluster=joint, show=show))
+
+
+def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
+    """Print or write the script of a job, and the next steps."""
+    script = cluster.script(out)
+    if not script:
+        if file is not None:
+            raise UsageError(f"--script must not be given with --cluster {cluster.kind}")
+        return
+    if file is None:
+        say(f"\nscript of each job, for {cluster.submission()}:\n\n{script.rstrip()}\n")
+    else:
+        file.write_text(script, encoding="utf-8")
+        say(f"{cluster.submission()} {shlex.quote(str(file))}")
+    say(f"client: {same_command(('--dry-run',), ('--script',))}")
+
+
+def bench_set(
+    out: Folder,
+    /,
+    *,
+    only: Annotated[tuple[str, ...], Parameter(metavar="NAME")] = (),
+    overrides: Settings = (),
+    quiet: bool = False,
+    workers: Workers = Workers(),
+) -> None:
+    """Build the frozen benchmark drakegrasp-bench-1 in OUT.
+
+    The benchmark has 256 built-in objects, each with its own mass and friction, all for testing.
+    Their meshes are compared with the published hashes. It takes about an hour on one core. With
+    --only or --set the result is a part or a variant of the benchmark, and each card reports this.
+    The same command continues an interrupted build.
+
+    Args:
+        out: Directory of the benchmark.
+        only: Build this object only; may be given several times.
+        overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
+        quiet: Show no progress.
+    """
+    on = workers.asked()
+    print_report(dg.make_benchmark(out, only=only, overrides=overrides, **on, show=not quiet))
+
+
+def print_report(report: BuildReport) -> None:
+    """Print the results of a build, and the paths of its files.
+
+    Raises:
+        SystemExit: With code 1 if the machine has probably spoiled labels, which a line on standard
+            error has reported.
+    """
+    from drakegrasp.cli import tables
+
+    tables.print_stats(report.out)
+    if report.simulated:
+        reused = f" ({report.reused} had been done before)" if report.reused else ""
+        say(f"{counted(report.simulated, 'work unit')} simulated{reused}")
+    else:
+        again = "; the files were written again" * report.assembled
+        units = counted(report.reused, "work unit")
+        say(f"all {units} had been done before: nothing was simulated{again}")
+    for message, count in report.errors.items():
+        say(f"solver error in {counted(count, 'attempt')}: {message}")
+    for notice in report.notices:
+        say(notice)
+    for entry in report.refused:
+        say(f"refused: {entry.name}: {entry.reason}")
+    for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
+        if report.assembly is not None:
+            say(str(report.out / name))
+    if report.unexplained:
+        sys.exit(1)

@@ -1,0 +1,131 @@
+"""`score` writes a card of predicted grasps, with reference rows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+import drakegrasp as dg
+from drakegrasp.cli.arguments import (
+    AsJson,
+    DataFile,
+    Existing,
+    Folder,
+    Name,
+    Positive,
+    Settings,
+    Split,
+    Workers,
+    given,
+)
+from drakegrasp.cli.console import same_command, say, say_json, wrong_input
+from drakegrasp.cli.help import MORE
+
+#: Options that change no verdict: flags, and options with a value.
+IDLE = (
+    ("--json", "--quiet", "--tls", "--no-tls"),
+    ("--workers", "--scheduler", "--scheduler-file", "--tls-ca-file", "--tls-cert", "--tls-key"),
+)
+
+
+def score(
+    predictions: Annotated[tuple[Existing, ...], Parameter(name="PREDICTIONS")] = (),
+    /,
+    *,
+    dataset: DataFile,
+    split: Split = "test",
+    against: Annotated[tuple[Existing, ...], Parameter(metavar="FILE")] = (),
+    references: Annotated[tuple[str, ...], Parameter(name="--reference", metavar="NAME")] = (),
+    per_object: Positive | None = None,
+    out: Folder | None = None,
+    overrides: Settings = (),
+    as_json: AsJson = False,
+    quiet: bool = False,
+    train: Annotated[DataFile | None, Parameter(group=MORE)] = None,
+    frame: Annotated[
+        Literal["object", "camera", "table", "world"] | None, Parameter(group=MORE)
+    ] = None,
+    link: Annotated[Name | None, Parameter(group=MORE)] = None,
+    preshape: Annotated[Name | None, Parameter(group=MORE)] = None,
+    protocol: Annotated[str, Parameter(group=MORE, metavar="NAME|FILE.py:NAME")] = "lift",
+    workers: Workers = Workers(),
+) -> None:
+    """Score predicted grasps against reference rows.
+
+    Each of PREDICTIONS is a .npy, HDF5 or Parquet file of (n, 6k) numbers, one grasp per row of the
+    split, or (n, m, 6k), m grasps per row, in the camera's frame. It may also be a file of postures
+    with the `row` of each, or a file or folder of exported samples. Several files are treated as
+    several training runs of one method. Without PREDICTIONS only the reference rows are scored.
+
+    With --out the command writes card.json, card.md, card.png and the verdicts to DIR, so that an
+    interrupted score can continue.
+
+    Args:
+        predictions: Files of one method.
+        dataset: The data file of the predicted rows or views: OUT/grasping_oto.hdf5, _otm, or
+            OUT/scenes.hdf5.
+        split: Rows of the dataset.
+        against: Predictions of another method for the same rows: the card contains the difference
+            of the headlines. May be given several times, once per training run of that method.
+        references: Score these reference rows only; may be given several times: own, nearest image,
+            constant, random, top-down, closing, palm normals, surface. [default: all]
+        per_object: Maximum number of rows of each object.
+        out: Folder of the card and of the verdicts, from which the same command continues.
+            [default: nothing is written]
+        overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
+        as_json: Print the card as JSON.
+        quiet: Show neither progress nor the table.
+        train: Data file whose training rows are used for the reference rows. [default: --dataset]
+        frame: Frame of all postures, which overrides their files.
+        link: Frame or link of the poses in files of postures, which overrides the files: palm, the
+            palm link, or a frame of another tool that the hand file names, e.g. graspgen.
+        preshape: Preshape for rows of postures that name none; the value each, for palm poses
+            alone, tries all preshapes in turn.
+        protocol: The rule of a verdict, see `drakegrasp verify`. All protocols except lift try the
+            first wrist pose of a prediction in MuJoCo.
+    """
+    from drakegrasp.cli.tables import make_console, score_table
+    from drakegrasp.dataset.manifest import read_manifest
+    from drakegrasp.dataset.scenes import open_rows
+    from drakegrasp.exchange.attempts import holds_postures
+    from drakegrasp.scoring.card import share_text
+    from drakegrasp.scoring.references import REFERENCES
+
+    on = workers.asked()
+    with wrong_input():
+        read_manifest(dataset.parent)
+        bare = not references and bool(predictions) and all(map(holds_postures, predictions))
+        data = open_rows(dataset, split=split, fewer_fingers=bare)
+        trained = None if train is None else open_rows(train, split="train")
+    references = references or tuple(REFERENCES)
+    if data.has_fewer_fingers:
+        say("no reference rows: some samples leave fingers out", err=True)
+        references = ()
+    scored = dg.score(
+        predictions,
+        data,
+        against=against or None,
+        train=trained,
+        references=references,
+        per_object=per_object,
+        overrides=overrides,
+        read_as=given(frame=frame, link=link, preshape=preshape),
+        protocol=protocol,
+        out=out,
+        again=same_command(*IDLE),
+        **on,
+        show=not quiet,
+    )
+
+    if as_json:
+        say_json(scored.card, indent=1)
+    else:
+        for name, value in scored.card["headline"].items():
+            say(f"{name}: {share_text(value, 1, ' %')}")
+        if out is not None:
+            say(str(out / "card.md"))
+    if not quiet:
+        make_console(stderr=True).print(score_table(scored.card, scored.seconds))
+        for warning in scored.card["warnings"]:
+            say(f"warning: {warning}", err=True)
