@@ -240,6 +240,7 @@ def make_app(inspection: Inspection) -> Starlette:
     def get(path: str, show: Answer) -> Route:
         async def endpoint(request: Request) -> Response:
             name = request.path_params.get("name", "")
+            inspection.refuse_replaced()
             answer = await run_in_threadpool(show, inspection, name, request.query_params)
             inspection.refuse_replaced()
             return answer
