@@ -305,8 +305,8 @@ def _row_shape(
 # Plans
 
 
-def _array(name: str, shape: str, dtype: str, optional: bool = False) -> Field:
-    return Field(name, shape, dtype, "-", "-", "", optional=optional)
+def _array(name: str, shape: str, dtype: str) -> Field:
+    return Field(name, shape, dtype, "-", "-", "")
 
 
 #: Arrays of an object's plan, `objects/NAME.plan.h5`, in two tables whose columns have equally many
@@ -332,8 +332,8 @@ POSTURE_FIELDS = (
     *(_array(name, "j", "float64") for name in ("q_grasp", "q_pregrasp", "q_squeeze")),
     _array("row", "", "int64"),
 )
-#: Lists of texts in JSON; `preshape` is left out if all its texts are empty.
-POSTURE_TEXTS = (_array("said", "", "uint8"), _array("preshape", "", "uint8", optional=True))
+#: The list of their preshapes, as the bytes of JSON.
+POSTURE_PRESHAPES = _array("preshape", "", "uint8")
 _PLAN_ATTRIBUTES: Mapping[str, Kind] = {
     **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), str),
     "asked": int,
@@ -350,6 +350,6 @@ def refuse_other_plan(path: Path, file: h5py.File) -> None:
     resting, palms = PLAN_TABLES
     tables = [resting, palms]
     if "q_grasp" in file:
-        tables = [resting, (*palms, *POSTURE_FIELDS), *((text,) for text in POSTURE_TEXTS)]
+        tables = [resting, (*palms, *POSTURE_FIELDS), (POSTURE_PRESHAPES,)]
     for table in tables:
         refuse_first(path, differences(file, {"/": table}))

@@ -19,7 +19,12 @@ import numpy.typing as npt
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry
-from drakegrasp.dataset.opening import PLAN_TABLES, POSTURE_FIELDS, POSTURE_TEXTS, opened
+from drakegrasp.dataset.opening import (
+    PLAN_TABLES,
+    POSTURE_FIELDS,
+    POSTURE_PRESHAPES,
+    opened,
+)
 from drakegrasp.dataset.paths import (
     model_file_sha256,
     model_path,
@@ -118,14 +123,11 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
 
 
 def _save_postures(postures: Table, file: h5py.File) -> None:
-    """Write the columns of the postures; texts are stored as JSON."""
-    for field in (*POSTURE_FIELDS, *POSTURE_TEXTS):
-        data = postures[field.name]
-        if field.optional and not any(data.tolist()):
-            continue
-        if data.dtype.kind == "U":
-            data = np.frombuffer(json.dumps(data.tolist()).encode(), dtype=np.uint8)
-        file.create_dataset(field.name, data=data, dtype=field.dtype)
+    """Write the columns of the postures; their preshapes are stored as JSON."""
+    for field in POSTURE_FIELDS:
+        file.create_dataset(field.name, data=postures[field.name], dtype=field.dtype)
+    texts = json.dumps(postures.preshape.tolist()).encode()
+    file.create_dataset(POSTURE_PRESHAPES.name, data=np.frombuffer(texts, dtype=np.uint8))
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
@@ -142,7 +144,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     with opened(path, "the plan of an object") as file:
         attributes = dict(file.attrs)
         resting, palms = ({f.name: file[f.name][:] for f in fields} for fields in PLAN_TABLES)
-        names = [field.name for field in (*POSTURE_FIELDS, *POSTURE_TEXTS)]
+        names = [field.name for field in (*POSTURE_FIELDS, POSTURE_PRESHAPES)]
         given = {name: file[name][:] for name in names if name in file}
     due = config.simulation_hash()
     if attributes["config_hash"] != due:
@@ -161,12 +163,7 @@ def _given_postures(arrays: dict[str, AnyArray], path: Path) -> Table | None:
     if not arrays:
         return None
     try:
-        texts: dict[str, AnyArray] = {
-            name: np.array(list(map(str, parse_json(arrays[name].tobytes()))), dtype=str)
-            for name in ("said", "preshape")
-            if name in arrays
-        }
-        nothing = np.full(len(arrays["row"]), "")
-        return Table({"preshape": nothing, "said": texts["said"], **arrays, **texts})
+        preshape = np.array(list(map(str, parse_json(arrays.pop("preshape").tobytes()))), dtype=str)
+        return Table({**arrays, "preshape": preshape})
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: must hold postures, got none: {one_line(error)}") from None

@@ -60,7 +60,7 @@ UNIT_TOLERANCE = 1e-3
 #: others and from the meshes; a build draws its own conditions.
 _DECIDING = (
     *("objects", "resting", "X_TO", "X_FG", "q_grasp", "q_pregrasp", "q_squeeze", "frame", "X_TC"),
-    *("scale", "said", "preshape", "row"),
+    *("scale", "preshape", "row"),
 )
 #: Attributes of a table that apply to all its rows together.
 _OF_ALL = ("frame", "link", "file", "sha256", "without_rows")
@@ -260,13 +260,7 @@ class Attempts(GraspRows):
         """Return a hash (16 hex digits) of everything that decides a build."""
         digest = hashlib.sha256()
         for name in _DECIDING:
-            # Leave out columns without values, so that older tables without these columns keep
-            # their hash.
             value = getattr(self, name)
-            if name == "preshape" and not any(value):
-                continue
-            if name == "X_TO" and np.isnan(value).all():
-                continue
             is_array = isinstance(value, np.ndarray)
             digest.update(value.tobytes() if is_array else json.dumps(value).encode())
         return digest.hexdigest()[:16]
@@ -756,7 +750,7 @@ def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]
 
 
 #: Columns of postures that a plan has in addition to their palm poses.
-_IN_PLAN = ("q_grasp", "q_pregrasp", "q_squeeze", "row", "said", "preshape")
+_IN_PLAN = ("q_grasp", "q_pregrasp", "q_squeeze", "row", "preshape")
 
 
 def given_candidates(
