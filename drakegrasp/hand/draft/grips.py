@@ -43,8 +43,9 @@ SPACING = 0.0015
 #: Width of the pinched object [m], and the largest deviation from it.
 WIDTH, TOLERANCE = 0.04, 0.01
 #: Fraction of the closing by which both fingers hold the object, smallest distance between the pads
-#: in the open hand [m], and largest distance between pads that meet [m].
-LATE, OPENING, MEETING = 0.75, 0.05, 0.008
+#: in the open hand [m], and largest distance between pad points that meet [m]: a thumb that closes
+#: between two fingers passes both at half of their distance.
+LATE, OPENING, MEETING = 0.75, 0.05, 0.03
 #: Cost of other joints away from their rest [1]: they may leave it by 10 degrees for each degree by
 #: which that straightens the pinch.
 REST = 0.1
