@@ -17,7 +17,7 @@ from helpers.objects import box_model
 from helpers.successes import good
 
 from drakegrasp import registry
-from drakegrasp.cluster.kinds import cluster_of
+from drakegrasp.cluster.choice import cluster_of
 from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.attempts import read_attempts

@@ -123,6 +123,8 @@ def score(
                 show=show,
             )
             return
+
+        # This package's own trials.
         run_verification(
             placed,
             used,

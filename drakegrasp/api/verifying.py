@@ -100,6 +100,7 @@ def verify_grasp(
         raise GraspError(f"row must be one whole number, got {row!r}")
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
+
     placed, used = place_grasps(
         grasp,
         on,

@@ -91,7 +91,8 @@ def submit(
         script: Only write the script of a job.
     """
     from drakegrasp.api.building import known_work
-    from drakegrasp.cluster.kinds import Running, cluster_of, describe, present
+    from drakegrasp.cluster.choice import cluster_of, describe, present
+    from drakegrasp.cluster.kinds import Running
 
     options: dict[str, Any] = dict(workers=workers, cores=cores, memory=memory, walltime=walltime)
     options |= dict(interface=interface, host=host)

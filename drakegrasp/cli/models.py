@@ -30,7 +30,7 @@ def audit(
     *,
     units: Units = "m",
     manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
-    hand: Annotated[str, Parameter(metavar="NAME|YAML")] = "barrett",
+    hand: Annotated[str | None, Parameter(metavar="NAME|YAML")] = None,
     json_file: Annotated[NewFile | None, Parameter(name="--json")] = None,
     sheet: NewFile | None = None,
 ) -> None:
@@ -45,7 +45,8 @@ def audit(
         units: Unit of length of the meshes.
         manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
             of the meshes]
-        hand: Hand whose opening and stand-offs are compared with the objects' sizes.
+        hand: Hand whose opening and stand-offs are compared with the objects' sizes. [default:
+            barrett]
         json_file: Write all findings as JSON.
         sheet: Write a picture of every object with its status (.png).
     """
@@ -54,7 +55,7 @@ def audit(
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import atomic_path, write_atomic
 
-    own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"]).hand_source)
+    own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"] if hand else []).hand_source)
     limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
     with progress_bar("audit", "meshes") as progress:
         rows = audit_meshes(mesh_dir, units=units, manifest=manifest, **limits, progress=progress)

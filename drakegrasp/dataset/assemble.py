@@ -308,6 +308,8 @@ def _read_block(
             )
             first, last = max(start, shard.first), min(stop, shard.first + shard.count)
             tables.append(trials[first - shard.first : last - shard.first])
+
+            # The samples of these rows, for each camera.
             for split, ids in decisions.ids.items():
                 own = ids[slice(*np.searchsorted(ids, (first, last)))]
                 for camera in CAMERAS if len(own) else ():

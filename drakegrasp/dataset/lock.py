@@ -60,6 +60,7 @@ def build_lock(out: Path) -> Iterator[str | None]:
         ) from None
     except OSError as error:
         raise unwritable(out, error) from None
+
     with held:
         dead = _sign(path)
         try:

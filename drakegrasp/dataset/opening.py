@@ -270,6 +270,8 @@ def differences(file: h5py.File, tables: Tables) -> Iterator[Difference]:
                 if not f.optional or f.name in group:
                     yield Difference(path=path, what="the dataset must be there", got="none")
                 continue
+
+            # Its type, and its shape.
             dtype, shape = found.dtype, found.shape
             text = h5py.check_string_dtype(dtype) is not None
             if text != (f.dtype == "str") or not (text or dtype == np.dtype(f.dtype)):

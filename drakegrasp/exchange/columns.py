@@ -77,6 +77,8 @@ def read_table(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
             return dict(table.to_pydict()), [""] * table.num_rows
         except Exception as error:
             raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
+
+    # CSV: a row with too few or too many cells is invalid by itself.
     try:
         refuse_irregular(path, LARGEST_TEXT)
         with path.open(encoding="utf-8-sig", newline="") as file:

@@ -286,6 +286,8 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
         content = json.loads(head)
         if content["unit"] != dict(identity):
             return _History()
+
+        # The deaths of earlier runs, and the step in which the last one ended.
         for step, deaths in content["deaths"].items():
             history.deaths[step] = Deaths(**deaths)
         history.crash_loop = int(content["crash_loop"])

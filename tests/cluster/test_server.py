@@ -20,8 +20,8 @@ from server.processes import wait_until
 from server.slurm import PARTITION, queued_jobs, running_slurm
 
 from drakegrasp.cluster import jobqueue as jobs
+from drakegrasp.cluster.choice import cluster_of
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
-from drakegrasp.cluster.kinds import cluster_of
 from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
