@@ -68,7 +68,6 @@ MACHINES = [
 ]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="EGL and glibc are Linux's")
 @pytest.mark.parametrize(("check", "there", "ok", "what", "remedy"), MACHINES)
 def test_what_is_missing_is_told_with_what_mends_it(
     monkeypatch: pytest.MonkeyPatch, check: str, there: Any, ok: bool, what: str, remedy: str
