@@ -130,7 +130,11 @@ class Jobs(Local):
                 raise
             # Each class raises its own errors; report them all as errors of the machine.
             except Exception as error:
-                raise MachineError(f"the workers did not start: {one_line(error)}") from None
+                # What the scheduler's command said is at the end.
+                reason = " ".join(str(error).rpartition("stderr:")[2].split())
+                raise MachineError(
+                    f"the workers did not start: {reason or type(error).__name__}"
+                ) from None
             with closing_cluster(cluster), Client(cluster) as client:
                 yield client
 
