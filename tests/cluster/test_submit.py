@@ -21,8 +21,12 @@ from distributed import Client, rpc
 from distributed.security import Security
 from helpers import commands
 from helpers.assertions import assert_same_dataset
+<<<<<<< HEAD
 from helpers.commands import Result
 from helpers.commands import run as run_command
+=======
+from helpers.builds import build
+>>>>>>> f5152a72 (A build opens its directory once, and reads and hashes a mesh once)
 from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
 
@@ -35,7 +39,6 @@ from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect
 from drakegrasp.cluster.jobqueue import Jobs
 from drakegrasp.cluster.kinds import Local, cluster_of
 from drakegrasp.errors import ConfigError, MachineError
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.commands import error_line, run
 from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
@@ -20,7 +21,7 @@ from starlette.testclient import TestClient
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DataError
-from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import load_config
