@@ -105,7 +105,7 @@ def _refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
     Raises:
         DataError: If a mesh is missing.
     """
-    built = [entry.name for entry in (*known.objects, *known.refused)]
+    built = [entry.name for entry in known.objects] + [mesh.name for mesh in known.refused]
     missing = [name for name in built if name not in names]
     if missing:
         raise DataError(

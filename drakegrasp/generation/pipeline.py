@@ -279,7 +279,8 @@ class _Build:
             DataError: If there is no object, or objects of two splits have become one group.
         """
         manifest = self._manifest
-        before = {entry.name: entry for entry in (*manifest.objects, *manifest.refused)}
+        before: dict[str, ObjectEntry | RefusedMesh] = {e.name: e for e in manifest.objects}
+        before |= {entry.name: entry for entry in manifest.refused}
 
         # Reuse the manifest's entries of unchanged meshes.
         entries: dict[str, ObjectEntry | RefusedMesh] = {}

@@ -21,12 +21,9 @@ from distributed import Client, rpc
 from distributed.security import Security
 from helpers import commands
 from helpers.assertions import assert_same_dataset
-<<<<<<< HEAD
+from helpers.builds import build
 from helpers.commands import Result
 from helpers.commands import run as run_command
-=======
-from helpers.builds import build
->>>>>>> f5152a72 (A build opens its directory once, and reads and hashes a mesh once)
 from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
 
