@@ -493,7 +493,10 @@ class _Build:
         stale = not is_assembled(out, verify_shards=True)
         if stale:
             with self._progress("assemble", "shards") as report:
-                assemble_locked(out, self._manifest, surveyed=self._surveyed, progress=report)
+                surveyed = self._surveyed
+                if surveyed is None and self._successes:
+                    surveyed = survey(out, self._manifest, self._successes, progress=report)
+                assemble_locked(out, self._manifest, surveyed=surveyed, progress=report)
         else:
             write_card(out)  # the licence of a mesh may have changed
         scenes = self._config.scenes.when == "assembled"

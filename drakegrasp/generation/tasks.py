@@ -15,7 +15,7 @@ from drakegrasp.dataset.paths import places
 from drakegrasp.hand.folder import hand_places, moved_hand
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DatasetTask:
     """The input of a task on files of a dataset, as plain data.
 

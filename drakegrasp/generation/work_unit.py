@@ -100,7 +100,7 @@ class WorkUnit(DatasetTask):
         return self.header.path(self.out), self.header.journal_path(self.out)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class UnitSummary:
     """Summary of a completed unit, whose data are in its shard.
 

@@ -187,21 +187,6 @@ def test_a_damaged_copy_is_found_refused_and_made_again(copy: Path, tmp_path: Pa
     assert model.read_text() == whole
 
 
-def test_an_older_dataset_reads_the_hand_at_its_path_until_a_build_goes_on(
-    copy: Path, tmp_path: Path
-) -> None:
-    hand = write_hand(tmp_path / "elsewhere")
-    shutil.rmtree(copy / "hand")
-    edit_manifest(copy, lambda tree: (tree["config"].update(hand=str(hand)), tree.pop("joints")))
-    assert run("replay", copy, "--trial", success(copy)).exit_code == 0
-
-    report = go_on(copy, hand)
-    assert report.simulated == 0
-    shutil.rmtree(hand.parent)
-    assert run("replay", copy, "--trial", success(copy)).exit_code == 0
-    assert run("check", copy).exit_code == 0
-
-
 def test_merging_demands_the_same_hand_and_carries_it(
     passed_on: Path, copy: Path, tmp_path: Path
 ) -> None:
