@@ -20,7 +20,6 @@ import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.removal import find_hits, successes_by_rule
-from drakegrasp.dataset.assembly.successes import LOOK_COLUMNS, TRIAL_COLUMNS
 from drakegrasp.dataset.assembly.survey import headers_by_object, shard_successes
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import object_files, shards_folder
@@ -195,11 +194,8 @@ class _Experiment:
         with self._stage("write"):
             shard = Shard(header=header, trials=trials, looks={**looks})
             write_shard(self._unit.out, shard)
-        rows = (
-            Table(trials)
-            .only(*TRIAL_COLUMNS)[looks["row"]]
-            .with_columns(looks.only("row", *LOOK_COLUMNS), depth_otm=looks["image_otm"][:, 3])
-        )
+        rows = Table(trials)[looks["row"]]
+        rows = rows.with_columns(looks, depth_otm=looks["image_otm"][:, 3])
         return UnitSummary(
             header=header,
             outcomes=count_outcomes(trials["outcome"]),
