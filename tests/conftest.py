@@ -15,6 +15,7 @@ from unittest.mock import Mock
 
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.datasets import REPEATED, make_dataset
 from helpers.golden import Golden, compare
 from helpers.meshes import G3DB, SMALL, write_fixed
@@ -22,7 +23,6 @@ from helpers.objects import CUBE, box_model
 from hypothesis import HealthCheck, settings
 
 from drakegrasp.config import Config
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel

@@ -18,7 +18,7 @@ from distributed import Client
 from helpers.datasets import make_dataset
 
 from drakegrasp.api import building, verifying
-from drakegrasp.api.building import build_dataset, build_on
+from drakegrasp.api.building import build_dataset
 from drakegrasp.api.verifying import (
     run_verification,
     verify_grasp,
@@ -32,7 +32,6 @@ from drakegrasp.errors import ConfigError, GraspError, MachineError, MeshError
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import silent
@@ -367,9 +366,9 @@ def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
 def test_unknown_object_is_refused_before_anything_starts(
     small_meshes: Path, tmp_path: Path, objects: bool
 ) -> None:
-    sources = find_meshes(small_meshes) if objects else None
+    meshes = small_meshes if objects else "builtin"
     with pytest.raises(MeshError, match=r"only must be names of objects \(.*\), got '9_cup'"):
-        build_on(_never(), sources, tmp_path / "out", load_config(), only=["9_cup"])
+        build_dataset(meshes, tmp_path / "out", only=["9_cup"], cluster=_never())
     assert not (tmp_path / "out").exists()
 
 
@@ -380,9 +379,8 @@ def test_work_is_for_a_client_or_for_workers(tmp_path: Path) -> None:
 
 
 def test_build_that_gets_no_workers_leaves_nothing(small_meshes: Path, tmp_path: Path) -> None:
-    sources = find_meshes(small_meshes)
     with pytest.raises(MachineError, match="no workers"):
-        build_on(_none(), sources, tmp_path / "out", load_config(), show=False)
+        build_dataset(small_meshes, tmp_path / "out", cluster=_none(), show=False)
     assert not (tmp_path / "out").exists()
 
 
@@ -432,4 +430,4 @@ def test_workers_are_asked_whether_they_see_the_meshes_of_a_build(
     monkeypatch.setattr(building, "admitted_workers", refuse)
     client = nullcontext(SimpleNamespace(dashboard_link=""))
     with pytest.raises(MachineError, match="asked for 1_box_a"):
-        build_on(client, find_meshes(folder), tmp_path / "out", load_config(), show=False)  # type: ignore[arg-type]
+        build_dataset(folder, tmp_path / "out", cluster=client, show=False)  # type: ignore[arg-type]

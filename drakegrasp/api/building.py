@@ -6,44 +6,34 @@ These are the functions that `drakegrasp` exports and the command line calls.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, NamedTuple, Unpack
 
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, dashboard_line, has_dashboard, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.cluster.wire import by_wire
 from drakegrasp.config import BUILD_PRESET, Config
-from drakegrasp.dataset.lock import build_lock
-from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.errors import DataError, GraspError, counted
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.foreign_files import refuse_address
-from drakegrasp.generation.pipeline import (
-    BuildReport,
-    build_locked,
-    ended,
-    posture_config,
-    refuse_missing,
-    refuse_part,
-    refuse_unusable,
-)
+from drakegrasp.generation.build_config import build_config
+from drakegrasp.generation.directory import BuildDirectory, open_directory
+from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.generation.request import BUILTIN, Part, read_part, refuse_unknown
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.folder import carry_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.runtime.executor import Executor
+from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.attempts import Attempts, unknown_objects
-from drakegrasp.simulation.drive import drive_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -103,137 +93,117 @@ def build_dataset(
     """
     refuse_address(out)
     running = joined(client, workers) if cluster is None else cluster
-    out, config = Path(out).absolute(), config or load_config(BUILD_PRESET)
-    hand = load_hand(config.hand_source)
-    drive_of(hand, config.lift)
-    if isinstance(postures, str | Path):
-        postures = read_attempts(Path(postures), hand, read_as=read_as)
-    sources = find_sources(objects, units, manifest)
-    return build_on(
-        running,
-        sources,
-        out,
-        config,
-        only=only,
-        postures=postures,
-        part=None if part is None else read_part(part),
-        show=show,
-    )
-
-
-def find_sources(
-    objects: str | Path, units: str, manifest: str | Path | None
-) -> list[MeshSource] | None:
-    """Return the meshes of a directory, or None for the built-in objects.
-
-    Raises:
-        MeshError: If there is no mesh.
-    """
-    if str(objects) == BUILTIN:
-        return None
-    return find_meshes(objects, units=units, manifest=manifest)
-
-
-def build_on(
-    cluster: AbstractContextManager[Client],
-    sources: Sequence[MeshSource] | None,
-    out: Path,
-    config: Config,
-    *,
-    only: Sequence[str] = (),
-    postures: Attempts | None = None,
-    part: Part | None = None,
-    show: bool = True,
-) -> BuildReport:
-    """Build a dataset on the workers of a cluster; see `build_dataset`.
-
-    The directory is locked before the workers start, so a second build is rejected before that.
-
-    Args:
-        cluster: Starts workers, and yields their client, e.g. `connect(2)`.
-            Give an existing client as `contextlib.nullcontext(client)`.
-        sources: The meshes; None for the built-in objects.
-        out: Directory of the dataset, absolute.
-        config: All the rules.
-        only: See `build_dataset`.
-        postures: See `build_dataset`.
-        part: See `build_dataset`.
-        show: Whether to show progress on standard error.
-
-    Raises:
-        ConfigError, HandError: As `refuse_unusable` of `generation.pipeline`.
-        DataError: If `out` cannot be used, another process builds there, or no mesh can be
-            simulated.
-        MeshError: If `only` names no object.
-        MachineError: If a worker would give other results than this machine.
-    """
-    config = ended(posture_config(config, postures))
-    refuse_unusable(config)
-    refuse_part(part, config)
-    only, postures = _chosen(_names(sources, config), only, postures)
-    with build_lock(out) as dead, ExitStack() as stack:
-        # A directory that cannot be used is rejected before workers start.
-        before = claim_directory(out, config)
-
-        # Workers read the hand from the directory.
-        config = carry_hand(out, config, before.config.hand if before else None)
-        stack.callback(_release_unused, out)
-        client = stack.enter_context(cluster)
-        if show and has_dashboard() and client.dashboard_link:
-            sys.stderr.write(f"{dashboard_line(client)}\n")
-        meshes = [source.path for source in sources or ()]
-        travels = stack.enter_context(admitted_workers(client, config, out, meshes))
-
-        # The built-in objects become mesh files of the dataset.
+    config = config or load_config(BUILD_PRESET)
+    work = _asked(objects, config, units, manifest, only, postures, part, read_as)
+    with (
+        open_directory(Path(out).absolute(), work.config, work.names) as directory,
+        _workers_of(running, directory, work.sources or (), show=show) as (execute, pool),
+    ):
+        sources = work.sources
         if sources is None:
+            # The built-in objects become mesh files of the dataset.
+            folder = directory.out / BUILTIN_FOLDER
             with progress_bar("objects", "meshes", show=show) as report:
-                sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report, only)
-        sources = [source for source in sources if not only or source.name in only]
-
-        on_workers = DaskExecutor(client, resubmissions=RESUBMISSIONS)
-        execute: Executor = on_workers
-        if travels:
-            execute = stack.enter_context(by_wire(on_workers, client, out))
-        return build_locked(
+                sources = builtin_sources(folder, work.config.builtin, report, work.names)
+        return build(
+            directory,
             sources,
-            out,
-            config,
             execute,
-            dead=dead,
-            postures=postures,
-            part=part,
-            pool=on_workers.pool,
+            postures=work.postures,
+            part=work.part,
+            pool=pool,
             show=show,
         )
 
 
-def _names(sources: Sequence[MeshSource] | None, config: Config) -> list[str]:
-    """Return the names of the meshes, or of the built-in objects if `sources` is None."""
-    known = draw_builtin(config.builtin) if sources is None else sources
-    return [each.name for each in known]
+@contextmanager
+def _workers_of(
+    running: AbstractContextManager[Client],
+    directory: BuildDirectory,
+    sources: Sequence[MeshSource],
+    *,
+    show: bool,
+) -> Iterator[tuple[Executor, WorkerPool]]:
+    """Start the workers of a build and check them; yield their executor and their pool.
+
+    Args:
+        running: Starts the workers, and yields their client.
+        directory: The directory of the build.
+        sources: The meshes that workers read, unless they are in the directory.
+        show: Whether to print the address of the dashboard.
+    """
+    out, config = directory.out, directory.manifest.config
+    with running as client:
+        if show and has_dashboard() and client.dashboard_link:
+            sys.stderr.write(f"{dashboard_line(client)}\n")
+        meshes = [source.path for source in sources]
+        with admitted_workers(client, config, out, meshes) as travels:
+            execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
+            if not travels:
+                yield execute, execute.pool
+                return
+            with by_wire(execute, client, out) as sending:
+                yield sending, execute.pool
 
 
-def _chosen(
-    names: Sequence[str], only: Sequence[str], postures: Attempts | None
-) -> tuple[Sequence[str], Attempts | None]:
-    """Return the names of the objects to build, none for all, and the postures of these objects.
+class _Work(NamedTuple):
+    """What a build does, when all that is asked for is known to be there.
+
+    Attributes:
+        config: Configuration of the build.
+        sources: The meshes of the objects; None for the built-in objects.
+        names: Names of the objects.
+        postures: Postures of these objects; None: palm poses are drawn.
+        part: Part of the work units to run; all if None.
+    """
+
+    config: Config
+    sources: list[MeshSource] | None
+    names: list[str]
+    postures: Attempts | None
+    part: Part | None
+
+
+def _asked(
+    objects: str | Path,
+    config: Config,
+    units: str,
+    manifest: str | Path | None,
+    only: Sequence[str],
+    postures: str | Path | Attempts | None,
+    part: str | None,
+    read_as: Mapping[str, str] | None,
+) -> _Work:
+    """Return what a build with these arguments of `build_dataset` does; nothing is written.
 
     Raises:
-        MeshError: If `only` names no object.
-        GraspError: If no posture is for one of the objects.
+        MeshError, GraspError, ConfigError, HandError: As `build_dataset`.
     """
+    if isinstance(postures, str | Path):
+        hand = load_hand(config.hand_source)
+        postures = read_attempts(Path(postures), hand, read_as=read_as)
+    job = None if part is None else read_part(part)
+    config = build_config(config, postures, job)
+
+    # The objects, by their names.
+    if str(objects) == BUILTIN:
+        sources, names = None, [each.name for each in draw_builtin(config.builtin)]
+    else:
+        sources = find_meshes(objects, units=units, manifest=manifest)
+        names = [source.name for source in sources]
     refuse_unknown(only, names)
-    if postures is None:
-        return only, None
-    postures = postures.refuse(unknown_objects(postures, names))
-    named = dict.fromkeys(
-        name for name, bad in zip(postures.objects, postures.invalid, strict=True) if not bad
-    )
-    only = [name for name in named if not only or name in only]
-    if not only:
-        why = f": {postures.refused}" if postures.refused else ", got none of them"
-        raise GraspError(f"postures must be of an object that is built{why}")
-    return only, postures
+    chosen = [name for name in names if not only or name in only]
+    if postures is not None:
+        postures = postures.refuse(unknown_objects(postures, names))
+        given = zip(postures.objects, postures.invalid, strict=True)
+        valid = {name for name, bad in given if not bad}
+        chosen = [name for name in chosen if name in valid]
+        if not chosen:
+            why = f": {postures.refused}" if postures.refused else ", got none of them"
+            raise GraspError(f"postures must be of an object that is built{why}")
+    if sources is not None:
+        sources = [source for source in sources if source.name in chosen]
+    return _Work(config=config, sources=sources, names=chosen, postures=postures, part=job)
 
 
 def known_work(
@@ -243,7 +213,7 @@ def known_work(
     units: str = "m",
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
-    postures: Path | None = None,
+    postures: str | Path | Attempts | None = None,
     part: str | None = None,
     read_as: Mapping[str, str] | None = None,
 ) -> list[str]:
@@ -251,30 +221,22 @@ def known_work(
 
     Arguments and errors are those of `build_dataset`.
     """
-    hand = load_hand(config.hand_source)
-    table = None if postures is None else read_attempts(postures, hand, read_as=read_as)
-    config = ended(posture_config(config, table))
-    refuse_unusable(config)
-    job = None if part is None else read_part(part)
-    refuse_part(job, config)
-    drive_of(hand, config.lift)
-    names = _names(find_sources(objects, units, manifest), config)
-    only, table = _chosen(names, only, table)
-    count = len(set(only or names))
+    work = _asked(objects, config, units, manifest, only, postures, part, read_as)
+    config, count = work.config, len(work.names)
 
     # A posture is tried in each resting pose and with each preshape that it allows.
-    if table is not None:
-        rows = sum(len(table.of_object(name)) for name in only)
+    if work.postures is not None:
+        rows = sum(len(work.postures.of_object(name)) for name in work.names)
         return [f"{counted(count, 'object')}: {counted(rows, 'posture')}"]
     if config.has_target:
         return _target_lines(config, count)
     poses = config.candidates.max
-    work_units = count * sum(1 for _ in config.unit_ranges(poses))
+    number = count * sum(1 for _ in config.unit_ranges(poses))
     palms = counted(count * poses, "palm pose")
-    lines = [f"{counted(count, 'object')}: at most {palms} in {counted(work_units, 'work unit')}"]
-    if job is not None:
-        of_job = sum(map(job.has, range(work_units)))
-        lines.append(f"part {part}: at most {of_job:,} of these work units")
+    lines = [f"{counted(count, 'object')}: at most {palms} in {counted(number, 'work unit')}"]
+    if work.part is not None:
+        own = sum(map(work.part.has, range(number)))
+        lines.append(f"part {part}: at most {own:,} of these work units")
     return lines
 
 
@@ -294,12 +256,6 @@ def _target_lines(config: Config, objects: int) -> list[str]:
     size = min(wanted) * len(CAMERAS) * sum(image.nbytes for image in images)
     images_of = f"images of {counted(min(wanted), 'sample')}"
     return [*lines, f"{images_of}: {size / 1e6:,.1f} MB before compression"]
-
-
-def _release_unused(out: Path) -> None:
-    """Remove what a build put into a directory if it did not begin."""
-    if not (out / MANIFEST).exists():
-        release_directory(out)
 
 
 def make_benchmark(
@@ -327,29 +283,18 @@ def make_benchmark(
         MeshError: If `only` names no object.
         ConfigError, DataError, MachineError: As `build_dataset`.
     """
-    config, folder = load_config(PRESET, list(overrides)), Path(out).absolute()
-    with build_lock(folder):
-        # A directory that cannot be used is rejected before anything in it changes.
-        _claim_benchmark(folder, config, only)
-        with progress_bar("objects", "meshes", show=show) as report:
-            meshes = write_objects(folder, config, only=only, progress=report)
-    return build_dataset(
-        meshes, folder, config=config, only=only, client=client, show=show, **workers
-    )
-
-
-def _claim_benchmark(folder: Path, config: Config, only: Sequence[str]) -> None:
-    """Reject a directory that this call cannot build or continue as the benchmark.
-
-    Raises:
-        DataError: If it has other files, another dataset, or objects that `only` leaves out.
-    """
-    known = claim_directory(folder, config)
-    if known is None:
-        return
-    if not (folder / BUILTIN_FOLDER / BENCHMARK_FILE).is_file():
+    running, folder = joined(client, workers), Path(out).absolute()
+    config = build_config(load_config(PRESET, list(overrides)))
+    names = list(only) or [each.name for each in draw_builtin(config.builtin)]
+    if (folder / MANIFEST).exists() and not (folder / BUILTIN_FOLDER / BENCHMARK_FILE).is_file():
         raise DataError(
             f"{folder}: must be empty or hold {NAME}, got another dataset; choose another OUT"
         )
-    names = only or [each.name for each in draw_builtin(config.builtin)]
-    refuse_missing(known, names, folder)
+    with (
+        open_directory(folder, config, names) as directory,
+        _workers_of(running, directory, (), show=show) as (execute, pool),
+    ):
+        with progress_bar("objects", "meshes", show=show) as report:
+            meshes = find_meshes(write_objects(folder, config, only=only, progress=report))
+        sources = [source for source in meshes if source.name in names]
+        return build(directory, sources, execute, pool=pool, show=show)

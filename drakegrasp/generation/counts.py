@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.errors import ConfigError
 from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome
@@ -102,14 +100,3 @@ class Counts:
         if self._target is None:
             return self._done, self._palms
         return self._target.found, self._target.wanted if self._target.has_begun else None
-
-
-def refuse_two_ends(config: Config) -> None:
-    """Reject a configuration that limits both the number of grasps and the number of samples.
-
-    Raises:
-        ConfigError: If both are stated.
-    """
-    ends = config.samples, config.samples_per_object
-    if config.max_grasps is not None and ends != (None, None):
-        raise ConfigError("max_grasps must be null with samples or samples_per_object, got both")

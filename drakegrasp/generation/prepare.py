@@ -1,25 +1,27 @@
 """Prepares one mesh as a task, and rejects a mesh whose preparation crashes or hangs.
 
 Input: a mesh and the configuration, as plain data. Output: the object's files, and the entry in the
-manifest, which describes the object or states why the mesh was rejected.
+manifest, which describes the object or states why the mesh was rejected. The task reads and hashes
+the mesh file once.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
-from drakegrasp.dataset.paths import model_path, object_files, places
+from drakegrasp.dataset.paths import model_path, object_files
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
 from drakegrasp.frames import Array
-from drakegrasp.hand.folder import hand_places, moved_hand
+from drakegrasp.generation.tasks import DatasetTask
 from drakegrasp.objects.model import ObjectModel, prepare_object
-from drakegrasp.objects.sources import MeshSource
+from drakegrasp.objects.sources import MeshSource, read_source
 from drakegrasp.runtime.environment import one_thread, release_memory
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import (
@@ -42,40 +44,19 @@ PREPARE_SECONDS = 1800.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class PrepareTask:
-    """The input of a task that prepares a mesh, as plain data.
+class PrepareTask(DatasetTask):
+    """The input of a task that prepares a mesh.
 
     Attributes:
         source: The mesh.
-        mesh_sha256: Digest of the mesh, see `source_sha256`.
-        out: Directory of the dataset, as a path of the process that runs the task.
-        config: Configuration of the dataset.
         postures: Postures to try instead of palm poses of samplers; None: use the samplers.
         restartable: Whether the process that runs the task is restarted when it dies. If so, only
             the mesh is lost by a crash or a hang; if not, it propagates to the caller.
     """
 
     source: MeshSource
-    mesh_sha256: str
-    out: Path
-    config: Config
     postures: Attempts | None = None
     restartable: bool
-
-    def reads(self) -> dict[str, Path]:
-        """Return the files of the mesh, the hand and an earlier run, see `FileTask`."""
-        own = places(self.out, *object_files(self.out, self.source.name), self.journal)
-        return {self._mesh_place: self.source.path, **hand_places(self.config), **own}
-
-    def writes(self) -> tuple[str, ...]:
-        """Return the paths of the object's files and the journal, relative to the dataset."""
-        files = *object_files(self.out, self.source.name), self.journal
-        return tuple(path.relative_to(self.out).as_posix() for path in files)
-
-    def moved(self, folder: Path) -> PrepareTask:
-        """Return the task in a directory with copies of the files."""
-        source = replace(self.source, path=folder / self._mesh_place)
-        return replace(self, out=folder, source=source, config=moved_hand(self.config, folder))
 
     @property
     def journal(self) -> Path:
@@ -83,40 +64,51 @@ class PrepareTask:
         return model_path(self.out, self.source.name).with_suffix(".journal")
 
     @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The object's files and the journal."""
+        return *object_files(self.out, self.source.name), self.journal
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The files of an earlier run."""
+        return self.outputs
+
+    @property
     def _mesh_place(self) -> str:
         # Messages name the file, so the copy keeps its name.
-        return f"meshes/{self.mesh_sha256[:16]}/{self.source.path.name}"
+        return f"meshes/{self.source.name}/{self.source.path.name}"
+
+    def reads(self) -> dict[str, Path]:
+        """Return the files of the mesh, the hand and an earlier run by their places."""
+        return {self._mesh_place: self.source.path, **super().reads()}
+
+    def moved(self, folder: Path) -> Self:
+        """Return the task in a directory with copies of the files."""
+        source = replace(self.source, path=folder / self._mesh_place)
+        return replace(super().moved(folder), source=source)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DrawTask:
-    """The input of a task that draws more palm poses of a prepared object, as plain data.
+class DrawTask(DatasetTask):
+    """The input of a task that draws more palm poses of a prepared object.
 
     Attributes:
-        out: Directory of the dataset, as a path of the process that runs the task.
         name: Name of the object.
-        config: Configuration of the dataset.
         count: Number of palm poses, with those that are drawn already.
     """
 
-    out: Path
     name: str
-    config: Config
     count: int
 
-    def reads(self) -> dict[str, Path]:
-        """Return the files of the object and the hand, see `FileTask`."""
-        files = object_files(self.out, self.name)
-        return {**hand_places(self.config), **places(self.out, *files)}
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The object's files."""
+        return object_files(self.out, self.name)
 
-    def writes(self) -> tuple[str, ...]:
-        """Return the paths of the object's files, relative to the dataset."""
-        files = object_files(self.out, self.name)
-        return tuple(path.relative_to(self.out).as_posix() for path in files)
-
-    def moved(self, folder: Path) -> DrawTask:
-        """Return the task in a directory with copies of the files."""
-        return replace(self, out=folder, config=moved_hand(self.config, folder))
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The object's files."""
+        return self.outputs
 
 
 @one_thread
@@ -161,31 +153,31 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
     prepared again.
 
     Raises:
+        MeshError: If the mesh file cannot be read.
         DiskFullError: If there is no space for the object's files.
         MachineError: If something other than the mesh kills the process repeatedly.
     """
     out, name, config = task.out, task.source.name, task.config
     with disk_full_named(out):
         # The worker or the client may have died before the object was in the manifest.
-        entry = _entry_there(task)
+        read = _, digest = read_source(task.source)
+        entry = _entry_there(task, digest)
         if entry is not None:
             return name, entry
         if not task.restartable:
-            return name, _prepared_entry(task)
+            return name, _prepared_entry(task, read)
 
         # The journal identifies a mesh that kills its process, which is then rejected.
         release_memory()
-        identity = {
-            "name": name,
-            "mesh_sha256": task.mesh_sha256,
-            "config_hash": config.simulation_hash(),
-        }
+        config_hash = config.simulation_hash()
+        identity = {"name": name, "mesh_sha256": digest, "config_hash": config_hash}
         with open_journal(task.journal, identity) as journal:
             verdict = journal.verdict(PREPARE)
             if verdict is not None:
                 # More memory may help, so the next build tries again.
                 again = verdict is Verdict.VANISHED
-                return name, _refused(task, f"preparing it {verdict.value}", again=again)
+                reason = f"preparing it {verdict.value}"
+                return name, RefusedMesh(name=name, mesh_sha256=digest, reason=reason, again=again)
             if journal.in_crash_loop:
                 raise MachineError(
                     f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; "
@@ -193,52 +185,50 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
                 )
             with journal.step(PREPARE, PREPARE_SECONDS):
                 inject_fault(name)
-                return name, _prepared_entry(task)
+                return name, _prepared_entry(task, read)
 
 
-def _entry_there(task: PrepareTask) -> ObjectEntry | None:
+def _entry_there(task: PrepareTask, digest: str) -> ObjectEntry | None:
     """Return the entry of an object whose files are complete, or None."""
     try:
         prepared = load_prepared(task.out, task.source.name, task.config)
     except DrakegraspError:
         return None
     model = prepared.model
-    same = (model.class_name, model.mesh_sha256) == (task.source.class_name, task.mesh_sha256)
+    same = (model.class_name, model.mesh_sha256) == (task.source.class_name, digest)
     return prepared.entry() if same and prepared.asked >= first_palms(task.config) else None
 
 
-def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
+def _prepared_entry(task: PrepareTask, read: tuple[bytes, str]) -> ObjectEntry | RefusedMesh:
     try:
-        prepared = prepare(task.source, task.config, task.postures)
+        prepared = prepare(task.source, task.config, task.postures, read)
     except MeshError as error:
         # The entry already has the name.
-        return _refused(task, str(error).removeprefix(f"{task.source.path.name}: "))
-
-    # The digest was computed when the file was read before.
-    if prepared.model.mesh_sha256 != task.mesh_sha256:
-        return _refused(task, "the mesh file changed during the build")
+        reason = str(error).removeprefix(f"{task.source.path.name}: ")
+        return RefusedMesh(name=task.source.name, mesh_sha256=read[1], reason=reason)
     save_prepared(prepared, task.out, task.config)
     return prepared.entry()
 
 
-def _refused(task: PrepareTask, reason: str, *, again: bool = False) -> RefusedMesh:
-    name, digest = task.source.name, task.mesh_sha256
-    return RefusedMesh(name=name, mesh_sha256=digest, reason=reason, again=again)
-
-
-def prepare(source: MeshSource, config: Config, postures: Attempts | None = None) -> PreparedObject:
+def prepare(
+    source: MeshSource,
+    config: Config,
+    postures: Attempts | None = None,
+    read: tuple[bytes, str] | None = None,
+) -> PreparedObject:
     """Return a mesh as an object at rest on the table, with its palm poses.
 
     Args:
         source: The mesh.
         config: Configuration of the dataset.
         postures: Postures to try instead of palm poses of samplers.
+        read: Content and hash of the file, see `read_source`; None: the file is read now.
 
     Raises:
         MeshError: If the mesh cannot be repaired, its size is implausible, or the object does
             not come to rest.
     """
-    model = prepare_object(source, config.objects)
+    model = prepare_object(source, config.objects, read)
     resting = find_resting_poses(model, config)
 
     # Compute the distance field here as well. If it hangs or needs too much memory, only the mesh

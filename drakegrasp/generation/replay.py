@@ -81,8 +81,6 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
     record = try_attempt(setup, attempt)
     row = trial_rows(setup, [attempt], [record])
-    if stored["outcome"] == Outcome.SLIPPED and record.outcome is Outcome.PARTLY_HELD:
-        row["outcome"][0] = Outcome.SLIPPED  # the name in older versions
 
     # Find what the hand touches in a start collision.
     meetings = {}

@@ -26,7 +26,7 @@ from drakegrasp.dataset.hdf5 import AnyArray, create_field, packed_chunk, write_
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
 from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
-from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE, object_files, places
+from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE, object_files
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, count_scenes, grasps_of_trials
 from drakegrasp.dataset.schema import (
@@ -43,8 +43,8 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
 from drakegrasp.generation.attempts import find_attempt
+from drakegrasp.generation.tasks import DatasetTask
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.folder import hand_places, moved_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.hand.settings import override_config
@@ -260,41 +260,32 @@ Columns = dict[str, AnyArray]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SceneTask:
-    """The input of a task that creates the scenes of an object.
+class SceneTask(DatasetTask):
+    """The input of a task that creates the scenes of an object; its result are the scenes.
 
     Attributes:
-        out: Directory of the dataset.
         name: Name of the object.
         split: Split of the scenes, as an index into SPLITS.
-        config: Configuration of the object.
         joints: Names of the hand's joints, in the order of the files.
         trials: Columns GRASPS_FOLLOW_FROM of trials.hdf5 (n rows) of the object's closed hands.
         samples: (n,), which of these rows are samples.
     """
 
-    out: Path
     name: str
     split: int
-    config: Config
     joints: Sequence[str]
     trials: Columns
     samples: AnyArray
 
-    def reads(self) -> dict[str, Path]:
-        """Return the files of the prepared object and the hand, see `FileTask`."""
-        return {
-            **hand_places(self.config),
-            **places(self.out, *object_files(self.out, self.name)),
-        }
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The files of the prepared object."""
+        return object_files(self.out, self.name)
 
-    def writes(self) -> tuple[str, ...]:
-        """Return no paths, because the scenes are the result of the task."""
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """No files."""
         return ()
-
-    def moved(self, folder: Path) -> SceneTask:
-        """Return the task in a directory with copies of the files."""
-        return replace(self, out=folder, config=moved_hand(self.config, folder))
 
 
 @one_thread

@@ -12,17 +12,17 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.removal import find_hits
-from drakegrasp.dataset.assembly.successes import successes_of
+from drakegrasp.dataset.assembly.removal import find_hits, successes_by_rule
 from drakegrasp.dataset.assembly.survey import headers_by_object, shard_successes
 from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.dataset.paths import object_files, places, shards_folder
+from drakegrasp.dataset.paths import object_files, shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, ROBUST_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, write_shard
 from drakegrasp.errors import DataError, MachineError
@@ -37,7 +37,7 @@ from drakegrasp.generation.attempts import (
     trial_setup,
     try_attempt,
 )
-from drakegrasp.hand.folder import hand_places, moved_hand
+from drakegrasp.generation.tasks import DatasetTask
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed, trim_memory
 from drakegrasp.runtime.files import disk_full_named
@@ -75,38 +75,31 @@ _STEPS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkUnit:
-    """The input of a task that runs attempts, as plain data.
+class WorkUnit(DatasetTask):
+    """The input of a task that runs attempts.
 
     Attributes:
-        out: Directory of the dataset, as a path of the process that runs the task.
         header: Object and range of candidates.
-        config: Configuration of the dataset.
         restartable: Whether the process that runs the unit is restarted when it dies. If so, a
             crash or a hang ends only the attempt; if not, it propagates to the caller.
     """
 
-    out: Path
     header: ShardHeader
-    config: Config
     restartable: bool = False
 
-    def reads(self) -> dict[str, Path]:
-        """Return the files of the object and the hand, and the journal if any, see `FileTask`."""
-        files = *object_files(self.out, self.header.object_name), self.header.journal_path(self.out)
-        return {**hand_places(self.config), **places(self.out, *files)}
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The files of the object, and the journal if there is one."""
+        name, journal = self.header.object_name, self.header.journal_path(self.out)
+        return *object_files(self.out, name), journal
 
-    def writes(self) -> tuple[str, ...]:
-        """Return the paths of the shard and the journal, relative to the dataset."""
-        files = self.header.path(self.out), self.header.journal_path(self.out)
-        return tuple(path.relative_to(self.out).as_posix() for path in files)
-
-    def moved(self, folder: Path) -> WorkUnit:
-        """Return the unit in a directory with copies of the files."""
-        return replace(self, out=folder, config=moved_hand(self.config, folder))
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The shard and the journal."""
+        return self.header.path(self.out), self.header.journal_path(self.out)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class UnitSummary:
     """Summary of a completed unit, whose data are in its shard.
 
@@ -116,6 +109,8 @@ class UnitSummary:
         seconds: Wall-clock time by stage (`build`, `try`, `measure`, `look`, `repeat` if there are
             repeats, `write`) [s]; for logs only. Empty if the shard existed already.
         errors: Number of solver errors by message.
+        successes: The successes with what filters need of each, see `successes_by_rule`; None
+            without a target.
         hits: Candidates and stand-offs of the attempts that count for the target, see `find_hits`;
             empty without a target.
     """
@@ -124,6 +119,7 @@ class UnitSummary:
     outcomes: dict[Outcome, int]
     seconds: dict[str, float]
     errors: dict[str, int]
+    successes: Table | None = None
     hits: tuple[tuple[int, int], ...] = ()
 
 
@@ -198,18 +194,15 @@ class _Experiment:
         with self._stage("write"):
             shard = Shard(header=header, trials=trials, looks={**looks})
             write_shard(self._unit.out, shard)
+        rows = Table(trials)[looks["row"]]
+        rows = rows.with_columns(looks, depth_otm=looks["image_otm"][:, 3])
         return UnitSummary(
             header=header,
             outcomes=count_outcomes(trials["outcome"]),
             seconds=self._seconds,
             errors=dict(self._errors),
-            hits=self._hits(trials, looks) if self._config.has_target else (),
+            **_judged(rows, self._config),
         )
-
-    def _hits(self, trials: dict[str, AnyArray], looks: Table) -> tuple[tuple[int, int], ...]:
-        """Return the attempts that count for the target."""
-        rows = Table(trials)[looks["row"]]
-        return _hits(rows.with_columns(looks, depth_otm=looks["image_otm"][:, 3]), self._config)
 
     @contextmanager
     def _step(self, step: str) -> Iterator[None]:
@@ -338,13 +331,21 @@ def _find_unit(out: Path, header: ShardHeader, config: Config) -> UnitSummary | 
         return None
     with open_shard(path, header) as (file, _):
         outcomes = count_outcomes(file["trials/outcome"][:])
-        hits = _hits(shard_successes(file), config) if config.has_target else ()
-    return UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, hits=hits)
+        judged = _judged(shard_successes(file), config) if config.has_target else {}
+    return UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, **judged)
 
 
-def _hits(rows: Table, config: Config) -> tuple[tuple[int, int], ...]:
-    """Return the hits among the successes of a unit, given their rows as `successes_of` does."""
-    return find_hits(successes_of(rows, config.camera), config)
+def _judged(rows: Table, config: Config) -> dict[str, Any]:
+    """Return the successes and hits of a unit for its summary; empty without a target.
+
+    Args:
+        rows: Columns of the successes, see `shard_successes`.
+        config: Configuration of the dataset.
+    """
+    if not config.has_target:
+        return {}
+    successes = successes_by_rule(rows, config)
+    return {"successes": successes, "hits": find_hits(successes, config)}
 
 
 def find_tasks(out: Path, manifest: Manifest) -> Iterator[tuple[ShardHeader, ...]]:

@@ -158,19 +158,24 @@ class ObjectModel:
 # Preparation
 
 
-def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> ObjectModel:
+def prepare_object(
+    source: MeshSource,
+    config: ObjectConfig | None = None,
+    read: tuple[bytes, str] | None = None,
+) -> ObjectModel:
     """Return the simulated object of a mesh file, repaired if that invents no shape.
 
     Args:
         source: The mesh file, with its unit of length.
         config: Mass of objects without their own mass, and limits of size and faces; the defaults
             if None.
+        read: Content and hash of the file, see `read_source`; None: the file is read now.
 
     Raises:
         MeshError: If the file is not a mesh, its size is implausible, or it cannot become a solid;
             the message has the reason.
     """
-    mesh, digest = load_source(source)
+    mesh, digest = load_source(source, read)
     vertices, faces = upright_vertices(mesh, source), np.asarray(mesh.faces)
     del mesh  # it may be large
     config = config or ObjectConfig()

@@ -271,27 +271,42 @@ def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
 # Reading a mesh
 
 
-def source_sha256(source: MeshSource) -> str:
-    """Return the SHA-256 of a mesh file's bytes and of the object's attributes, hexadecimal.
+def read_source(source: MeshSource) -> tuple[bytes, str]:
+    """Return a mesh file's bytes, and the SHA-256 of them and of the object's attributes.
 
-    Name, class, licence and group do not affect it.
+    The hash is hexadecimal. Name, class, licence and group do not affect it.
 
     Raises:
         MeshError: If the file cannot be read.
     """
-    return _sha256(read_bytes(source.path), source)
+    content = read_bytes(source.path)
+    return content, _sha256(content, source)
 
 
-def load_source(source: MeshSource) -> tuple[trimesh.Trimesh, str]:
-    """Return a mesh in the file's units and axes, and its hash as in `source_sha256`.
+def source_sha256(source: MeshSource) -> str:
+    """Return the hash of `read_source`.
+
+    Raises:
+        MeshError: If the file cannot be read.
+    """
+    return read_source(source)[1]
+
+
+def load_source(
+    source: MeshSource, read: tuple[bytes, str] | None = None
+) -> tuple[trimesh.Trimesh, str]:
+    """Return a mesh in the file's units and axes, and its hash as in `read_source`.
 
     The file is read once, so the hash certainly belongs to these triangles.
+
+    Args:
+        source: The mesh file.
+        read: What `read_source` returned; None: the file is read now.
 
     Raises:
         MeshError: If the file cannot be read or contains no finite triangles.
     """
-    content = read_bytes(source.path)
-    digest = _sha256(content, source)
+    content, digest = read or read_source(source)
     vertices, faces = parse_mesh(source.path.name, content)
     del content
     if len(faces) > MANY_FACES:

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from distributed import Client
 from helpers.assertions import assert_same_dataset
+from helpers.builds import build
 from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES
 from server.processes import wait_until
@@ -22,7 +23,6 @@ from server.slurm import PARTITION, queued_jobs, running_slurm
 from drakegrasp.cluster import jobqueue as jobs
 from drakegrasp.cluster.choice import cluster_of
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

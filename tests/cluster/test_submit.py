@@ -21,6 +21,7 @@ from distributed import Client, rpc
 from distributed.security import Security
 from helpers import commands
 from helpers.assertions import assert_same_dataset
+from helpers.builds import build
 from helpers.commands import Result
 from helpers.commands import run as run_command
 from helpers.meshes import write_fixed
@@ -36,7 +37,6 @@ from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect
 from drakegrasp.cluster.jobqueue import Jobs
 from drakegrasp.cluster.kinds import Local
 from drakegrasp.errors import ConfigError, MachineError
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

@@ -20,7 +20,7 @@ import pytest
 import trimesh
 from distributed import Client, LocalCluster, Worker
 from helpers import faults
-from helpers.builds import FAST
+from helpers.builds import FAST, build
 from helpers.file_tasks import Join, join
 from helpers.tiers import in_second_tier
 
@@ -35,7 +35,8 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import make_pose, rotation_about
-from drakegrasp.generation.pipeline import BuildReport, build, posture_config
+from drakegrasp.generation.build_config import build_config
+from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
@@ -262,7 +263,7 @@ def test_postures_travel(client: Client, meshes: Path, out: Path, tmp_path: Path
     turned = over @ make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2), np.zeros(3))
     names, X_TG = ["1_box_a"] * 2, np.stack([over, turned])
     given = make_attempts(load_hand(), names, X_FG=X_TG, frame="table", resting=[0, 0])
-    config, here = posture_config(load_config(overrides=FAST), given), tmp_path / "here"
+    config, here = build_config(load_config(overrides=FAST), given), tmp_path / "here"
     build(find_meshes(meshes), here, config, run_here, postures=given, show=False)
     build_by_wire(client, meshes, out, config, given)
     assert_same_files(here, out)

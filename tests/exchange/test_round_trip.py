@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.commands import run
 from helpers.datasets import OTO
 from helpers.tiers import in_second_tier
@@ -31,7 +32,7 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation.pipeline import build, posture_config
+from drakegrasp.generation.build_config import build_config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
@@ -226,7 +227,7 @@ def test_what_goes_out_comes_in_again(
 
     # As a dataset of its own.
     config = load_config("fast", [*RULES, *OBJECTS, *SAMPLES])
-    config = posture_config(config, table)
+    config = build_config(config, table)
     again = tmp_path / "out"
     build(find_meshes(meshes, units="cm"), again, config, run_here, postures=table, show=False)
     trials = Trials(again)
@@ -260,7 +261,7 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
     # In a build each is an attempt of the row.
     table = read_attempts(path, load_hand(HAND), of=NAME)
     table = replace(table, objects=(NAME,) * len(table))
-    config = posture_config(load_config("fast", [*RULES, *OBJECTS, *SAMPLES]), table)
+    config = build_config(load_config("fast", [*RULES, *OBJECTS, *SAMPLES]), table)
     again = tmp_path / "out"
     build(find_meshes(meshes, units="cm"), again, config, run_here, postures=table, show=False)
     trials = Trials(again)

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.commands import error_line, run
 from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
@@ -20,7 +21,7 @@ from starlette.testclient import TestClient
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DataError
-from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import load_config
@@ -184,21 +185,6 @@ def test_a_damaged_copy_is_found_refused_and_made_again(copy: Path, tmp_path: Pa
     assert "must hold the hand of the dataset" in error_line(run("replay", copy, "--trial", 0))
     go_on(copy, write_hand(tmp_path / "elsewhere"))
     assert model.read_text() == whole
-
-
-def test_an_older_dataset_reads_the_hand_at_its_path_until_a_build_goes_on(
-    copy: Path, tmp_path: Path
-) -> None:
-    hand = write_hand(tmp_path / "elsewhere")
-    shutil.rmtree(copy / "hand")
-    edit_manifest(copy, lambda tree: (tree["config"].update(hand=str(hand)), tree.pop("joints")))
-    assert run("replay", copy, "--trial", success(copy)).exit_code == 0
-
-    report = go_on(copy, hand)
-    assert report.simulated == 0
-    shutil.rmtree(hand.parent)
-    assert run("replay", copy, "--trial", success(copy)).exit_code == 0
-    assert run("check", copy).exit_code == 0
 
 
 def test_merging_demands_the_same_hand_and_carries_it(

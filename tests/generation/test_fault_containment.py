@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.assertions import assert_same_dataset
-from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
+from helpers.builds import FAST, build, finish, start_build, wait_for_shards, workers_of
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
@@ -25,7 +25,6 @@ from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.generation import attempts
-from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes

@@ -9,11 +9,11 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.meshes import write
 
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

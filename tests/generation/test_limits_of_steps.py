@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 import trimesh
 from helpers import faults
+from helpers.builds import build
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh, read_manifest
 from drakegrasp.errors import MachineError
-from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.prepare import PrepareTask, prepare_one
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import MeshSource, find_meshes, source_sha256
+from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS
 
@@ -70,14 +70,7 @@ def config() -> Config:
 
 def prepare_tasks(sources: list[MeshSource], out: Path, config: Config) -> list[PrepareTask]:
     return [
-        PrepareTask(
-            source=source,
-            mesh_sha256=source_sha256(source),
-            out=out,
-            config=config,
-            restartable=True,
-        )
-        for source in sources
+        PrepareTask(source=source, out=out, config=config, restartable=True) for source in sources
     ]
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers import datasets
 from helpers.assertions import arrays_of, assert_same_arrays
+from helpers.builds import build
 from helpers.datasets import (
     BOTH,
     BOXES,
@@ -31,7 +32,6 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.errors import DataError
 from drakegrasp.generation.merge import merge
-from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.settings import load_config, override_config

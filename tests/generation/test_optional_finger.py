@@ -6,13 +6,14 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.hands import write_with_optional_fingers
 from helpers.meshes import SMALL
 from helpers.objects import write_above
 
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.filters import Removal
-from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from helpers.meshes import SMALL, write_fixed
@@ -26,7 +27,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
-from drakegrasp.generation.pipeline import build, refuse_unusable
+from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
@@ -154,7 +155,7 @@ def test_it_takes_turns_with_others_and_comes_to_workers(own: Path, box: ObjectM
     received = pickle.loads(sent)
     assert received == config and received.filters.code.keys() == set(config.filters.own)
     assert draw(box, received).source.tolist() == [Source.OWN, Source.NORMALS] * 10
-    refuse_unusable(received)
+    build_config(received)
     assert override_config(received, ["seed=3"]).code == config.code
 
 
@@ -180,7 +181,7 @@ def test_a_class_that_cannot_be_used_is_refused_in_one_line(
     text, message = WRONG_SAMPLERS[name]
     Path("mine.py").write_text(text)
     with pytest.raises(ConfigError, match=message) as caught:
-        refuse_unusable(load_config(overrides=["candidates.method=mine.py:Mine"]))
+        build_config(load_config(overrides=["candidates.method=mine.py:Mine"]))
     assert "\n" not in str(caught.value)
 
 

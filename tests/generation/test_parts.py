@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.builds import build
 from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from helpers.meshes import write_fixed
@@ -15,8 +16,8 @@ from helpers.meshes import write_fixed
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.merge import merge
-from drakegrasp.generation.pipeline import build, refuse_part
 from drakegrasp.generation.request import Part, read_part
 from drakegrasp.generation.work_unit import run_unit
 from drakegrasp.hand.settings import load_config
@@ -128,6 +129,6 @@ def test_each_unit_is_of_one_part() -> None:
 
 
 def test_a_number_of_samples_has_no_parts(tmp_path: Path) -> None:
-    refuse_part(None, load_config("paper", ["samples=5"]))
+    build_config(load_config("paper", ["samples=5"]))
     with pytest.raises(ConfigError, match="part must be of a build with a number of palm poses"):
-        refuse_part(Part(1, 2), load_config("paper", ["samples=5"]))
+        build_config(load_config("paper", ["samples=5"]), part=Part(1, 2))

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.assertions import assert_same_dataset
+from helpers.builds import build
 from helpers.tiers import few
 
 from drakegrasp.api.building import build_dataset
@@ -26,7 +27,7 @@ from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
 from drakegrasp.filters import Removal
-from drakegrasp.generation.pipeline import BuildReport, build
+from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.generation.prepare import prepare_one
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.generation.work_unit import run_unit

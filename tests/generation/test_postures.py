@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +10,11 @@ import h5py
 import numpy as np
 import pytest
 from helpers.assertions import assert_same_arrays
+from helpers.builds import build
 from helpers.hands import write_with_preshapes
 from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 
-from drakegrasp.api.building import build_on
+from drakegrasp.api.building import known_work
 from drakegrasp.config import Config
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
@@ -24,7 +24,7 @@ from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import make_pose, unpack_pose
-from drakegrasp.generation.pipeline import build, posture_config
+from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.generation.scenes import make_scenes
@@ -95,7 +95,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
 
 
 def built(meshes: Path, out: Path, table: Attempts, config: Config | None = None) -> Path:
-    config = posture_config(config or CONFIG, table)
+    config = build_config(config or CONFIG, table)
     build(find_meshes(meshes), out, config, run_here, postures=table, show=False)
     return out
 
@@ -130,7 +130,7 @@ def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
 
 
 def test_plan_keeps_what_the_file_said(dataset, table):
-    config = posture_config(CONFIG, table)
+    config = build_config(CONFIG, table)
     kept = load_prepared(dataset, NAME, config).candidates.postures
     np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
     assert kept.preshape.tolist() == [""] * 4
@@ -144,7 +144,7 @@ def test_plan_whose_texts_are_nested_too_deeply_is_refused_in_a_line(dataset, ta
         file["preshape"] = np.frombuffer(b"[" * 100_000, dtype=np.uint8)
     seal(path)
     with pytest.raises(DataError, match="must hold postures, got none: values nested too deeply"):
-        load_prepared(tmp_path, NAME, posture_config(CONFIG, table))
+        load_prepared(tmp_path, NAME, build_config(CONFIG, table))
 
 
 def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path):
@@ -190,7 +190,7 @@ def test_rows_that_are_no_posture_are_told_and_spoil_no_other(meshes, table, dat
         scale=scale,
     )
     mixed = mixed.refuse(unknown_objects(mixed, [NAME]))
-    config = posture_config(CONFIG, mixed)
+    config = build_config(CONFIG, mixed)
     report = build(find_meshes(meshes), tmp_path, config, run_here, postures=mixed, show=False)
     trials, alone = Trials(tmp_path), Trials(dataset)
     assert trials["posture_row"].tolist() == [0.0, 3.0]
@@ -216,8 +216,7 @@ def test_file_without_any_posture_is_refused(meshes, table, tmp_path):
     with pytest.raises(
         GraspError, match=r"must be of an object that is built: 4 of 4 rows .*got 'cup'"
     ):
-        build_on(nullcontext(None), find_meshes(meshes), tmp_path, CONFIG,
-                 postures=replace(table, objects=("cup",) * 4))  # fmt: skip
+        known_work(meshes, config=CONFIG, postures=replace(table, objects=("cup",) * 4))
 
 
 #: Closing positions at which the fingers of a posture begin [rad].
@@ -310,9 +309,9 @@ def test_hash_of_postures_is_of_their_preshapes_too():
 def test_settings_that_name_other_postures_are_refused(table):
     config = load_config(overrides=["candidates.postures='0123456789abcdef'"])
     with pytest.raises(ConfigError, match=r"candidates\.postures must be given with postures"):
-        posture_config(config, None)
+        build_config(config, None)
     with pytest.raises(ConfigError, match="must be left out; the postures that are given decide"):
-        posture_config(config, table)
+        build_config(config, table)
 
 
 def test_ordinary_configuration_does_not_know_of_postures():
@@ -328,7 +327,7 @@ def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path
     there = table.X_FG.copy()
     there[:, :3, 3] += CUBE / 2.0
     moved = replace(table, X_FG=there, frame="mesh")
-    prepared = prepare(source, posture_config(CONFIG, moved), moved)
+    prepared = prepare(source, build_config(CONFIG, moved), moved)
     np.testing.assert_allclose(prepared.candidates.X_OG, table.X_FG, atol=1e-9)
 
     # The object knows the frame; a dataset, whose meshes are exported in {O}, does not guess.

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers.builds import build
 from helpers.physics import broken_physics
 from helpers.tiers import few
 
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.assertions import assert_same_dataset
+from helpers.builds import build
 from helpers.meshes import SMALL
 
 from drakegrasp.api.verifying import verify_grasps
@@ -18,7 +19,6 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CONDITION_FIELDS
-from drakegrasp.generation.pipeline import build
 from drakegrasp.generation.replay import record_trial, replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes

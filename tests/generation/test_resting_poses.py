@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from cross_check import cross_check
 from helpers.assertions import assert_same_arrays, assert_same_dataset
+from helpers.builds import build
 from helpers.meshes import write_fixed
 
 from drakegrasp.config import Config
@@ -22,7 +23,6 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome

@@ -8,7 +8,7 @@ import pytest
 
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError
-from drakegrasp.generation.counts import refuse_two_ends
+from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.target import Target
 from drakegrasp.hand.settings import load_config
 
@@ -245,4 +245,4 @@ def test_samples_that_the_filter_of_outliers_removes_are_made_up_for() -> None:
 def test_grasps_and_samples_cannot_both_end_a_build() -> None:
     config = load_config(max_grasps=3, samples=4)
     with pytest.raises(ConfigError, match="max_grasps must be null with samples"):
-        refuse_two_ends(config)
+        build_config(config)

@@ -1,4 +1,4 @@
-"""Builds by the command line, in processes of their own."""
+"""Builds in this process by any executor, and by the command line in processes of their own."""
 
 from __future__ import annotations
 
@@ -7,9 +7,21 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from helpers import faults
+
+from drakegrasp.config import Config
+from drakegrasp.generation import pipeline
+from drakegrasp.generation.build_config import build_config
+from drakegrasp.generation.directory import open_directory
+from drakegrasp.generation.pipeline import BuildReport
+from drakegrasp.generation.request import Part
+from drakegrasp.objects.sources import MeshSource
+from drakegrasp.runtime.executor import Executor
+from drakegrasp.simulation.attempts import Attempts
 
 #: Six units of half a second for each object, so that none goes with another and a build can be
 #: stopped in time; of six attempts one succeeds.
@@ -31,6 +43,22 @@ FAST = [
     "camera.size=32",
     "filters.outlier_sigma=0",
 ]
+
+
+def build(
+    sources: Sequence[MeshSource],
+    out: Path,
+    config: Config,
+    execute: Executor,
+    *,
+    postures: Attempts | None = None,
+    part: Part | None = None,
+    **options: Any,
+) -> BuildReport:
+    """Build the dataset of some meshes in a directory."""
+    config = build_config(config, postures, part)
+    with open_directory(out, config, [source.name for source in sources]) as directory:
+        return pipeline.build(directory, sources, execute, postures=postures, part=part, **options)
 
 
 def start_build(

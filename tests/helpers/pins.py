@@ -27,9 +27,9 @@ from typing import Any, TypeAlias
 import h5py
 import numpy as np
 import trimesh
+from helpers.builds import build as build_here
 
 import drakegrasp
-from drakegrasp.generation.pipeline import build as build_here
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.shapes.catalog import builtin_sources
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from helpers.builds import build
 from helpers.hands import write_linked
 from helpers.meshes import write
 from helpers.objects import model_of
@@ -17,7 +18,6 @@ from drakegrasp.config import Config
 from drakegrasp.distinct import NEAR_SHIFT, NEAR_TURN, approach_cells
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, make_pose, rotation_about
-from drakegrasp.generation.pipeline import build
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, prepare_object

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from drakegrasp import registry
 from drakegrasp.config import Config, FilterConfig, is_own_class
+from drakegrasp.dataset.assembly.successes import successes_of
 from drakegrasp.errors import ConfigError, listed
 from drakegrasp.filters import Flags, Removal, Rule, first_removal, is_outlier
 from drakegrasp.registry import own_class, run_own
@@ -32,7 +33,8 @@ def judge_successes(
     """Return the `Removal` (n,) of each success.
 
     Args:
-        successes: The n successes, with the columns of `dataset.assembly.successes`.
+        successes: The n successes, with the columns of `dataset.assembly.successes`, and of
+            `by_rule` if the rules have been applied to each before.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
 
@@ -40,7 +42,9 @@ def judge_successes(
         ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
     """
     # Filters that judge each grasp by itself.
-    removal, own = first_removal(successes, config), _removed_by_own(config, successes)
+    known = successes.has("by_rule")
+    removal = successes["by_rule"].copy() if known else first_removal(successes, config)
+    own = _removed_by_own(config, successes)
     removal[own & (removal == Removal.KEPT)] = Removal.OWN
 
     # Outliers among the remaining grasps of an object that use the same fingers.
@@ -109,6 +113,19 @@ def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
             )
         removed |= ~kept
     return removed
+
+
+def successes_by_rule(rows: Table, config: Config) -> Table:
+    """Return the successes of a shard, with the first rule that removes each as column `by_rule`.
+
+    Args:
+        rows: Columns of the n successes, see `survey.shard_successes`.
+        config: Configuration, whose camera and limits of filters are used.
+    """
+    successes = successes_of(rows, config.camera)
+    return successes.with_columns(
+        trial_id=rows["row"].astype(np.int64), by_rule=first_removal(successes, config.filters)
+    )
 
 
 def find_hits(successes: Table, config: Config) -> tuple[tuple[int, int], ...]:

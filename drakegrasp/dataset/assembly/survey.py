@@ -72,12 +72,20 @@ class Survey:
         return self.shards[-1].first + self.shards[-1].count
 
 
-def survey(out: Path, manifest: Manifest, *, progress: Report = silent) -> Survey:
+def survey(
+    out: Path,
+    manifest: Manifest,
+    known: Mapping[ShardHeader, Table] | None = None,
+    *,
+    progress: Report = silent,
+) -> Survey:
     """Survey the shards of a dataset.
 
     Args:
         out: Directory of the dataset.
         manifest: Its manifest.
+        known: The successes of each shard, as `successes_by_rule` returns them; None: they are read
+            from the shards.
         progress: Called with the number of surveyed shards and the number of all.
 
     Raises:
@@ -93,16 +101,22 @@ def survey(out: Path, manifest: Manifest, *, progress: Report = silent) -> Surve
             # depend on how many more attempts the workers had begun.
             palms, tried = file["trials/candidate"][:], manifest.objects[i].tried
             count = len(palms) if tried is None else int(np.count_nonzero(palms < tried))
-            rows = shard_successes(file)
+            if known is None:
+                rows = shard_successes(file)
+                successes = successes_of(rows, manifest.config.camera)
+                successes = successes.with_columns(trial_id=rows["row"].astype(np.int64))
+            else:
+                successes = known[header]
             if not letters:
                 letters = sizes(
-                    fingers=rows["closed_touching"].shape[1],
+                    fingers=file["trials/closed_touching"].shape[1],
                     joints=file["trials/closed_q"].shape[1],
                     image=file["looks/image_otm"].shape[-1],
                 )
-        rows = rows[rows["row"] < count]
-        successes = successes_of(rows, manifest.config.camera, object=i)
-        tables.append(successes.with_columns(trial_id=first + rows["row"].astype(np.int64)))
+        successes = successes[successes["trial_id"] < count]
+        own = np.full(successes.count, i, dtype=np.int32)
+        ids = first + successes["trial_id"]
+        tables.append(successes.with_columns(object=own, trial_id=ids))
         shards.append(ShardRows(header=header, object=i, first=first, count=count))
         first += count
         progress(len(shards), 2 * len(headers))

@@ -1,0 +1,114 @@
+"""The directory in which a build works, from its lock to its last file.
+
+Input: a path and the configuration of a build. Output: while the block runs, a directory that this
+process holds, that contains the hand, and whose manifest the build completes. A directory that
+cannot be used is rejected before any worker starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from drakegrasp.config import CarriedHand, Config
+from drakegrasp.dataset.lock import build_lock
+from drakegrasp.dataset.manifest import (
+    Manifest,
+    claim_directory,
+    finger_names,
+    package_versions,
+    release_directory,
+)
+from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.errors import DataError, counted, listed
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.folder import carry_hand
+from drakegrasp.hand.parsing import position_order
+from drakegrasp.runtime.files import disk_full_named, sweep_temporary
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildDirectory:
+    """A directory that this process holds for a build.
+
+    Attributes:
+        out: The directory.
+        manifest: Manifest of the dataset, with the hand in the directory. If the build continues a
+            dataset, it has the objects of that dataset; the file is not changed yet.
+        is_new: Whether there is no dataset yet.
+        notices: What was repaired in the directory, in words.
+    """
+
+    out: Path
+    manifest: Manifest
+    is_new: bool
+    notices: tuple[str, ...]
+
+
+@contextmanager
+def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterator[BuildDirectory]:
+    """Hold a directory for a build while the block runs.
+
+    If the block does not write a manifest, everything that was put into the directory is removed.
+
+    Args:
+        out: The directory; new, empty, or with a dataset of this configuration.
+        config: Configuration of the build, see `build_config`.
+        names: Names of the objects of the build.
+
+    Raises:
+        DataError: If the directory cannot be used, another process builds there, or the dataset
+            has a mesh that is not among the objects.
+        HandError: If the hand's files cannot be read.
+        DiskFullError: If the disk is full, also if it fills while the block runs.
+    """
+    with build_lock(out) as dead, disk_full_named(out):
+        known = claim_directory(out, config)
+        if known is not None:
+            _refuse_missing(known, names, out)
+        config = carry_hand(out, config, known.config.hand if known else None)
+        notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
+        if swept := [str(path.relative_to(out)) for path in sweep_temporary(out)]:
+            files = counted(len(swept), "temporary file")
+            notices.append(f"{files} ({listed(swept)}) of dead processes removed")
+        try:
+            yield BuildDirectory(
+                out=out,
+                manifest=_manifest(config, known),
+                is_new=known is None,
+                notices=tuple(notices),
+            )
+        finally:
+            if not (out / FILE_NAME).exists():
+                release_directory(out)
+
+
+def _manifest(config: Config, known: Manifest | None) -> Manifest:
+    """Return the manifest with which a build begins; its hand is that of the directory."""
+    source = config.hand_source
+    assert isinstance(source, CarriedHand)
+    versions = package_versions() if known is None else known.versions
+    hand = load_hand(source)
+    return replace(
+        known or Manifest(config=config, versions=versions, fingers=finger_names(config)),
+        config=config,
+        joints=position_order(hand.model, hand.palm_link),
+        versions={**versions, "hand": source.digest},
+    )
+
+
+def _refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
+    """Check that all meshes from which a dataset was built are given to continue it.
+
+    Raises:
+        DataError: If a mesh is missing.
+    """
+    built = [entry.name for entry in known.objects] + [mesh.name for mesh in known.refused]
+    missing = [name for name in built if name not in names]
+    if missing:
+        raise DataError(
+            f"{out}: must be given every mesh that it was built from, got none named "
+            f"{missing[0]}; choose another --out"
+        )
