@@ -144,7 +144,7 @@ def test_cluster_starts_its_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ("write_palms", lambda *_: None, "and return their number, got TypeError (int() "),
         ("write_palms", lambda *_: sys.exit("no licence"), "got SystemExit (no licence)"),
         ("write_palms", lambda out: 1, "got TypeError ("),
-        ("write_palms", 7, "must be a function, got int"),
+        ("write_palms", 7, "must write the samples and return their number, got TypeError"),
         ("read_palms", lambda *_: 1 / 0, "got ZeroDivisionError (division by zero)"),
         ("read_palms", lambda *_: sys.exit("no licence"), "got SystemExit (no licence)"),
         ("read_palms", lambda *_: 7, "got TypeError ("),

@@ -54,6 +54,18 @@ def read_place(kind: Any, tokens: tuple[Token, ...]) -> Path:
     return read_path(kind, tokens)
 
 
+def read_whole(kind: Any, tokens: tuple[Token, ...]) -> int:
+    """Return the whole number that a word states; cyclopts alone would round 1.5.
+
+    Raises:
+        ValueError: If it states none.
+    """
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"must be a whole number, got {tokens[0].value!r}") from None
+
+
 def refuse_missing(kind: Any, path: Path | None) -> None:
     """Reject a path at which nothing is."""
     if path is not None and not path.exists():
@@ -90,8 +102,8 @@ Folder: TypeAlias = Annotated[AnyPath, Parameter(metavar="DIR")]
 Dataset: TypeAlias = Annotated[AnyPath, Parameter(validator=tidy_dataset)]
 DataFile: TypeAlias = Annotated[Path, Parameter(converter=read_path, metavar="FILE")]
 #: Numbers of things.
-Count: TypeAlias = Annotated[int, Parameter(metavar="N")]
-Positive: TypeAlias = Annotated[int, Parameter(metavar="N", validator=Number(gte=1))]
+Count: TypeAlias = Annotated[int, Parameter(converter=read_whole, metavar="N")]
+Positive: TypeAlias = Annotated[Count, Parameter(validator=Number(gte=1))]
 #: Texts.
 Name: TypeAlias = Annotated[str, Parameter(metavar="NAME")]
 Preset: TypeAlias = Annotated[str, Parameter(metavar="YAML|PRESET")]
@@ -180,7 +192,8 @@ class What:
         keys |= given(samples_per_object=self.samples_per_object)
         keys |= given(**{"candidates.max": self.candidates})
         settings = [f"{key}={value}" for key, value in keys.items()]
-        return dg.load_config(self.config or BUILD_PRESET, [*self.overrides, *settings])
+        config = BUILD_PRESET if self.config is None else self.config
+        return dg.load_config(config, [*self.overrides, *settings])
 
 
 @Parameter(name="*", group=CLUSTER)

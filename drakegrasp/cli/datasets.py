@@ -172,7 +172,7 @@ def replay(
     out: Dataset,
     /,
     *,
-    trial: Annotated[int, Parameter(metavar="ID")],
+    trial: Annotated[Count, Parameter(metavar="ID")],
     html: NewFile | None = None,
 ) -> None:
     """Run a trial again and compare every value.

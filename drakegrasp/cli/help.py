@@ -40,7 +40,7 @@ def new_group(
         help_format="plaintext",
         help_formatter=PlainHelp(summaries or {}),
         # Flags have no negative form; of an option that is given twice, the last value counts.
-        default_parameter=Parameter(negative=(), allow_repeating=True),
+        default_parameter=Parameter(negative=(), negative_iterable=(), allow_repeating=True),
         group_arguments=ARGUMENTS,
         group_parameters=OPTIONS,
         **more,

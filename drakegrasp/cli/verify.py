@@ -100,7 +100,8 @@ class Target:
         for name in names:
             if (value := getattr(self, name)) != getattr(Target, name):
                 option = {"mesh": "object", "overrides": "set"}.get(name, name).replace("_", "-")
-                raise GraspError(f"--{option} must be left out {where}, got {value}")
+                got = ", ".join(value) if isinstance(value, tuple) else value
+                raise GraspError(f"--{option} must be left out {where}, got {got}")
 
 
 def verify(

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from drakegrasp import registry
-from drakegrasp.cli.arguments import AnyPath, Dataset, Folder, given
+from drakegrasp.cli.arguments import AnyPath, Count, Dataset, Folder, given
 from drakegrasp.cli.console import UsageError, progress_bar, say
 from drakegrasp.cli.help import new_group
 from drakegrasp.errors import counted
@@ -23,7 +23,7 @@ def inspect(
     /,
     *,
     results: Annotated[AnyPath | None, Parameter(name="--predictions", metavar="RESULTS")] = None,
-    port: Annotated[int, Parameter(metavar="N", validator=Number(gte=0, lte=65535))] = PORT,
+    port: Annotated[Count, Parameter(validator=Number(gte=0, lte=65535))] = PORT,
     no_browser: bool = False,
 ) -> None:
     """Look at grasps in a browser, and reject them.
@@ -107,7 +107,7 @@ def export_samples(
     form: Annotated[str, Parameter(name="--to", metavar="FORMAT")],
     licence: Annotated[str | None, Parameter(name=("--licence", "--license"), metavar="ID")] = None,
     attempts: Literal["samples", "failed", "all"] | None = None,
-    fps: Annotated[int | None, Parameter(metavar="N", validator=Number(gte=1, lte=120))] = None,
+    fps: Annotated[Count | None, Parameter(validator=Number(gte=1, lte=120))] = None,
     quiet: bool = False,
 ) -> None:
     """Write the samples of a dataset in another format.

@@ -43,6 +43,8 @@ def build_config(
     endless = "closing" in rules.method and rules.postures is None
     if endless and rules.max == MOST_PALMS and not config.has_target:
         config = config.model_copy(update={"samples_per_object": SAMPLES_PER_OBJECT})
+
+    # At most one end, and none for a part.
     ends = {key: getattr(config, key) for key in ("samples", "samples_per_object", "max_grasps")}
     ends = {key: value for key, value in ends.items() if value is not None}
     if "max_grasps" in ends and len(ends) > 1:
@@ -53,6 +55,8 @@ def build_config(
                 "part must be of a build with a number of palm poses (--candidates N) and no other "
                 f"end, got {key}={value}, whose work units depend on the results of all parts"
             )
+
+    # The hand, and classes that are not of this package.
     drive_of(load_hand(config.hand_source), config.lift)
     if rules.postures is None:
         refuse_samplers(config)

@@ -458,6 +458,7 @@ class _Build:
             )
             for header in headers
         )
+
         for summary in self._execute(run_unit, units):
             self._add(summary, counts, target)
             self.log(

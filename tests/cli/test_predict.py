@@ -65,7 +65,7 @@ def predict(files: Path, words: str):
         ("cloud.npy --mask cloud.npy", "--mask must be given with a depth image only, got a cloud"),
         ("cloud.npy --split test", "--split must be given with scenes only, got a cloud"),
         ("cloud.npy --network magic", "got 'magic'"),
-        ("cloud.npy --count 0", "0 is not in the range"),
+        ("cloud.npy --count 0", "Must be >= 1"),
         ("one.npy --units m", "must be a cloud (n, 3), got (4, 5): a depth image needs --camera"),
         (NINE, "--mask must be given with a depth image, got none"),
         ("one.npy --camera 9,9,2 --mask one.npy", "must be fx,fy,cx,cy in pixels, or a JSON file"),

@@ -122,7 +122,7 @@ def test_workers_elsewhere_need_a_certificate_unless_told_otherwise(
     ("arguments", "words"),
     [
         (["--workers", "0"], "workers must be at least 1, got 0"),
-        (["--cluster", "moab"], "error: Invalid value for '--cluster': 'moab' is not one of"),
+        (["--cluster", "moab"], "error: clusters must be one of local, slurm, pbs"),
         (["--scheduler", "tls://a:1", "--cluster", "slurm"], "--scheduler must be used without"),
         (["--scheduler", "tls://a:1", "--workers", "2"], "--workers must not be given"),
         (["--scheduler", "tcp://a:1"], "must have an address that begins with tls://"),

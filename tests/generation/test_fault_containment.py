@@ -307,8 +307,7 @@ def test_what_is_harmed_is_named_and_run_again(
     for path in (stale, alive, foreign, old):
         path.write_bytes(b"half")
     os.utime(old, (0, 0))
-    lock = {"process": {"host": "h", "pid": 5, "began": 1, "boot": ""}, "since": "s", "command": []}
-    (out / "build.lock").write_text(json.dumps(lock))
+    (out / "build.lock").write_text("process 5 on h, since s")
     report = build(find_meshes(meshes), out, config, run_here, show=False)
     assert (report.simulated, report.reused) == (4, UNITS - 4)
     taken, swept, damaged = report.notices

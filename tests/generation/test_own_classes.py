@@ -354,5 +354,5 @@ def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
     # With another file it is another dataset.
     (own / "my_sampler.py").write_text((own / "my_sampler.py.txt").read_text() + "\n")
     other = load_config(overrides=[*rules, settings[0]])
-    with pytest.raises(DataError, match=r"candidates\.method \(my_sampler\.py:Ring@.* there, "):
+    with pytest.raises(DataError, match=r"candidates\.method \(\['my_sampler\.py:Ring@.* there, "):
         build(sources, out, other, run_here, show=False)

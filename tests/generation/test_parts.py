@@ -115,7 +115,7 @@ def test_parts_are_refused_where_one_is_missing(tmp_path: Path) -> None:
 def test_what_is_no_part_is_one_line(text: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"part must be I/N, with I from 1 to N, got"):
         read_part(text)
-    words = ["build", "--objects", "builtin", "--out", str(tmp_path / "out"), "--part", text]
+    words = ["build", "--objects", "builtin", "--out", str(tmp_path / "out"), f"--part={text}"]
     assert "part must be I/N" in error_line(run(*words))
     assert not (tmp_path / "out").exists()
 

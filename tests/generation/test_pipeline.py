@@ -362,7 +362,8 @@ def test_repeats_come_with_the_samples_and_change_none(
         assert not [name for name in plain["trials"] if name.startswith("robust")]
         assert np.array_equal(file["trials/slip"][:], plain["trials/slip"][:][own], equal_nan=True)
         lifted = np.isfinite(file["trials/time_lift"][:])
-    assert (tried[kept] == 2).all()
+    # Samples by the default filters are repeated, since the filters of a dataset may change.
+    assert {*tried[kept].tolist()} == {0, 2}
     assert not tried[~lifted].any()
     assert (repeated <= tried).all()
     assert (repeated[kept] == 2).any()

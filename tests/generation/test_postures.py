@@ -314,10 +314,6 @@ def test_settings_that_name_other_postures_are_refused(table):
         build_config(config, table)
 
 
-def test_ordinary_configuration_does_not_know_of_postures():
-    assert "postures" not in load_config().to_dict()["candidates"]
-
-
 def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path, table):
     # The file's origin is a corner of the cube, its unit a centimetre.
     box = box_model(tmp_path, [CUBE] * 3, NAME)

@@ -9,7 +9,6 @@ from helpers.datasets import make_dataset
 
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.outcomes import Outcome
-from drakegrasp.seeding import Stream
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +30,6 @@ def test_drawn_rows_are_of_their_kind(dataset, kind):
         assert len(set(few) & samples) == len(set(few) - samples) == 2
     else:
         assert len(few) == 2
-
-
-def test_disturbances_come_in_both_directions():
-    found = list(relift.disturbances(Stream(0)))
-    names = [name for name, *_ in found]
-    assert names.count("palm") == relift.PALMS and names.count("together") == relift.TOGETHER
-    for of in (1, 2):  # friction, mass
-        factors = sorted(row[of] for row in found if row[0].startswith(("friction", "mass")))
-        assert factors[0] - 1.0 == pytest.approx(1.0 - factors[-1])
-    assert {row[3] for row in found if row[0] in ("palm", "together")} == {True}
 
 
 def test_summary_counts_what_has_a_verdict():

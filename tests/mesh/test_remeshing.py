@@ -105,7 +105,7 @@ def scanned_bowl() -> trimesh.Trimesh:
 
 def test_thin_noisy_scan_keeps_its_shape(tmp_path):
     """Quadric decimation alone leaves edges with four faces where the wall touches itself."""
-    model = prepare(write(tmp_path / "bowl.ply", scanned_bowl()))
+    model = prepare(write(tmp_path / "bowl.obj", scanned_bowl()))
     assert_sound(model)
     assert 14_000 < len(model.visual_faces) < 18_000
     assert 0.0 < model.collision_error < 2e-3

@@ -313,8 +313,8 @@ def test_command_prints_a_line_per_file_and_writes_a_file(
         (["--protocol", "dexgraspbench", "--simulator", "drake"], "must be mujoco, got drake"),
         (["--simulator", "mujoco"], "--simulator of protocol lift must be drake, got mujoco"),
         (["--protocol", "dexgraspbench"], "hand must be an MJCF"),
-        (["--protocol", "dexgraspbench", "--units", "mm"], "--units must not be used"),
-        (["--protocol", "dexgraspbench", "--set", "seed=1"], "--set must not be used"),
+        (["--protocol", "dexgraspbench", "--units", "mm"], "--units must be left out with"),
+        (["--protocol", "dexgraspbench", "--set", "seed=1"], "--set must be left out with"),
         (["--assets", "."], "--assets must be used with another --protocol"),
     ],
 )

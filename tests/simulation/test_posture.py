@@ -76,7 +76,7 @@ def test_joints_in_another_order_are_told_by_their_names():
         ({"q_grasp": np.full(8, np.nan)}, "q_grasp must be finite numbers"),
         ({"q_squeeze": ["a"] * 8}, "squeeze joints must be numbers .*, got text"),
         ({"X_FG": np.zeros((4, 4))}, "the palm's pose must have 0 0 0 1"),
-        ({"frame": "mesh"}, "X_OM must be given for the frame mesh"),
+        ({"frame": "mesh"}, "X_OM must be given with the frame mesh"),
         ({"frame": "table"}, "X_TO must be given with the frame table, got None"),
         ({"frame": "camera", "X_TO": X}, "X_TC must be given with the frame camera"),
         ({"X_TC": X}, "X_TC must be given with the frame camera, and only then"),

@@ -192,10 +192,6 @@ CLUSTER_OPTIONS: dict[str, tuple[str, ...]] = {
     "--workers": (*_EXTREME, "0", "1000001"),
     "--cores": (*_EXTREME, "0", "1000001"),
     "--memory": ("", " ", "x", "-1GB", "nan", "inf", "0", "0GB", "1e400GB", "1e30GB", "٣GB"),
-    "--walltime": (
-        *("", " ", "x", "-1:00:00", "00:00:00", "1:2:3:4", "1.5", "nan", "٣:00:00", "²"),
-        *("9" * 5000 + ":00:00", "1-", "-", "1:"),
-    ),
 }
 #: Ports that `inspect` cannot have.
 PORTS = ("", " ", "x", "-1", "65536", "1.5", "nan", "9" * 5000)
