@@ -12,7 +12,7 @@ import builtin_objects
 import click
 import dataset_format
 import pytest
-from cyclopts import App
+from helpers.commands import arguments_of
 from helpers.scripts import load_script
 
 from drakegrasp.cli.main import COMMANDS, app
@@ -195,7 +195,7 @@ def command_lines(page: Path) -> Iterator[tuple[str, set[str], list[str]]]:
     """Yield the commands of a page's plain code blocks with their options and arguments."""
     text = "\n".join(blocks(page, "")).replace("\\\n", " ")
     for name, rest in re.findall(r"^drakegrasp ([a-z][a-z-]*)(.*)", text, re.M):
-        yield name, options_of(app[name]), shlex.split(rest, comments=True)
+        yield name, options_of(name), shlex.split(rest, comments=True)
     # The baseline cannot be loaded without torch; tests/test_baseline.py runs it.
     for script, rest in re.findall(r"^python pipelines/(?!baseline/)([\w/]+)\.py(.*)", text, re.M):
         command = load_script(script).main
@@ -204,12 +204,15 @@ def command_lines(page: Path) -> Iterator[tuple[str, set[str], list[str]]]:
             yield script, options, shlex.split(rest, comments=True)
 
 
-def options_of(command: App) -> set[str]:
+def options_of(*command: str) -> set[str]:
     """Return the options of a command, of a group those of all its commands."""
-    below = [command[name] for name in command if not name.startswith("-")]
-    options = {"--help", "-h"}.union(*map(options_of, below))
-    if command.default_command is not None:
-        options |= {name for each in command.assemble_argument_collection() for name in each.names}
+    here = app
+    for name in command:
+        here = here[name]
+    below = [name for name in here if not name.startswith("-")]
+    options = {"--help", "-h"}.union(*(options_of(*command, name) for name in below))
+    if here.default_command is not None:
+        options |= {name for each in arguments_of(*command) for name in each.names}
     return {name for name in options if name.startswith("-")}
 
 
@@ -230,10 +233,10 @@ def test_docs_name_commands() -> None:
 def test_the_command_page_has_every_command_and_its_options() -> None:
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", read(COMMAND_PAGE), re.M | re.S))
     assert list(sections) == list(COMMANDS)
-    shared = options_of(app["build"])
+    shared = options_of("build")
     for name in COMMANDS:
         named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", sections[name]))
-        options = options_of(app[name]) - {"--help", "-h"}
+        options = options_of(name) - {"--help", "-h"}
         assert named <= options | shared, name
         # `submit` takes the options of a build, which its section refers to.
         assert options <= named | (shared if name == "submit" else set()), name

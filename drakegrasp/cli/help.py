@@ -38,6 +38,7 @@ def new_group(
         name=name,
         help=text,
         help_format="plaintext",
+        suppress_keyboard_interrupt=False,
         help_formatter=PlainHelp(summaries or {}),
         # Flags have no negative form; of an option that is given twice, the last value counts.
         default_parameter=Parameter(negative=(), negative_iterable=(), allow_repeating=True),

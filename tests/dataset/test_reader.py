@@ -34,6 +34,7 @@ def write_data_file(path: Path, trial_ids: range, unused: int = 0) -> Path:
         file.attrs["near"], file.attrs["far"], file.attrs["seed"] = 0.01, 0.75, 0
         file.attrs["camera"] = "oto"
         file.attrs["config"] = file.attrs["versions"] = file.attrs["fingers"] = "{}"
+        file.attrs["joints"], file.attrs["split_by"] = "[]", "object"
         for key in ("signature", "shards", "config_hash"):
             file.attrs[key] = "of a test"
         for split in SPLITS:

@@ -221,8 +221,11 @@ def test_what_a_file_holds_is_told_from_its_content(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ([], "--object MESH or --dataset FILE must be given with postures"),
-        (["--frame", "camera"], "--frame must be left out with postures, got camera"),
+        ([], "--object MESH or --dataset FILE must be given where the grasps are not in"),
+        (
+            ["--object", "a.obj", "--frame", "camera"],
+            "--frame must be left out with postures, got camera",
+        ),
     ],
 )
 def test_options_that_postures_answer(tmp_path: Path, options: list[str], why: str) -> None:

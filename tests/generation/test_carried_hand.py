@@ -15,7 +15,6 @@ from helpers.commands import error_line, run
 from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
-from helpers.pages import state_of
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.manifest import read_manifest
@@ -113,7 +112,7 @@ def test_the_page_shows_the_hand(passed_on: Path, shapes: dict[str, bytes]) -> N
     with TestClient(make_app(Inspection(passed_on)), base_url="http://127.0.0.1") as client:
         for number, surface in enumerate(shapes.values()):
             assert client.get(f"/mesh/link-{number}.json").content == surface
-        page = client.get(f"/grasp/{state_of(client).label(0)}")
+        page = get(client, "/grasp/0-0-0")
     assert page.status_code == 200 and "the hand cannot be shown" not in page.text
 
 

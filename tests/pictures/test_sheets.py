@@ -61,7 +61,8 @@ def write_data_file(path: Path, names: list[str], split: str = "train") -> None:
     }
     with h5py.File(path, "w") as file:
         file.attrs.update(schema_version=SCHEMA_VERSION, K=K, near=CAMERA.near, far=CAMERA.far)
-        file.attrs.update(seed=0, config="{}", versions="{}", camera="oto")
+        file.attrs.update(seed=0, config="{}", versions="{}", camera="oto", fingers="{}")
+        file.attrs["joints"], file.attrs["split_by"] = "[]", "object"
         file.attrs.update(signature="of a test", shards="of a test", config_hash="of a test")
         for name in SPLITS:
             group, rows = file.create_group(name), len(names) if name == split else 0
