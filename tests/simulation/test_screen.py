@@ -249,6 +249,14 @@ def test_fingers_start_before_they_may_cross(hand):
     assert gap(start + GAP_STRIDE) <= screen.FINGER_GAP
 
 
+def test_fingers_start_before_they_may_cross_in_an_attempt(cube, hand):
+    """In the air, with margins so wide that it is simulated: they start well before their ends."""
+    attempt = from_above(cube, 0.25)
+    found = ask(cube, hand, attempt, reach_margin=1.0, block_margin=1.0, clearance=1e-4)
+    assert found.outcome is None
+    assert max(found.closing) < 0.9 * min(path.angles[-1] for path in hand_paths(hand, 0.0).fingers)
+
+
 def lowest(hand: Hand) -> float:
     """Return how far the open hand reaches below its palm, which looks down [m]."""
     paths = hand_paths(hand, 0.0)
