@@ -61,7 +61,7 @@ KINDS |= {"pbs": "qsub", "lsf": "bsub", "sge": "qsub", "oar": "oarsub"}
 NEEDED = {"htcondor": "disk=1GB", "oar": "memory_per_core_property_name=mem"}
 TLS = ("--tls-ca-file", "--tls-cert", "--tls-key")
 #: Options that take such a text: it stands in the script or in the command of the client.
-TAKEN = {"--objects", "--out", "--script", "--manifest", "--postures", "--link", *TLS}
+TAKEN = {"--objects", "--out", "--script", "--manifest", "--postures", *TLS}
 TAKEN |= {"--interface", "--host"}
 
 
