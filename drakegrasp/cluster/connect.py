@@ -216,13 +216,13 @@ def _address_in(file: Path) -> str:
     """
     end = monotonic() + WRITE_SECONDS
     while True:
-        try:
-            return str(read_json(file)["address"])
-        except (OSError, ValueError, LookupError, TypeError):
-            if monotonic() > end:
-                raise MachineError(
-                    f"{file}: must be the file of a running Dask scheduler, got none"
-                ) from None
+        address = None
+        with suppress(OSError, ValueError, LookupError, TypeError):
+            address = read_json(file)["address"]
+        if isinstance(address, str):
+            return address
+        if monotonic() > end:
+            raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
         sleep(0.05)
 
 

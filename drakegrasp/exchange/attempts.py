@@ -432,7 +432,8 @@ def has_rows(path: Path) -> bool:
         GraspError: If the file cannot be read.
     """
     with named(path):
-        return path.suffix.lower() in (*ARRAYS, *TABLES) and "row" in column_names(path)
+        known = path.is_file() and path.suffix.lower() in (*ARRAYS, *TABLES)
+        return known and "row" in column_names(path)
 
 
 def files_in(folder: Path) -> list[Path]:

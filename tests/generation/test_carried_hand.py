@@ -15,6 +15,7 @@ from helpers.commands import error_line, run
 from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
+from helpers.pages import get
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.manifest import read_manifest
