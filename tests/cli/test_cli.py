@@ -605,7 +605,7 @@ def test_camera_ties_the_frame_to_the_table(cube: Path, tmp_path: Path) -> None:
         (pinch(), ["--dataset", "x.hdf5"], "--object or --dataset must be given, got both"),
         (pinch(), ["--hand", "octopus"], "octopus"),
         (pinch(), ["--workers", "0"], "workers must be at least 1, got 0"),
-        (pinch(), ["--workers", "some"], 'must be a whole number, got'),
+        (pinch(), ["--workers", "some"], "must be a whole number, got"),
         (pinch(), ["--frame", "world"], 'Choose from: "object", "camera", "table", "mesh"'),
         (
             pinch(),
