@@ -110,11 +110,11 @@ def test_nothing_that_is_typed_runs(
         name, folder = option.name, tmp_path / str(number)
         folder.mkdir()
         given = {"--cluster": kind, "--workers": "2", "--objects": "builtin"}
-        given |= {"--with": NEEDED[kind]} if kind in NEEDED else {}
         given |= {"--out": "out", "--script": str(folder / "script")}
         given |= dict.fromkeys(TLS, "key.pem") if name in TLS else {}
         given[name] = typed(option, text, folder)
         words = [word for pair in given.items() for word in pair]
+        words += ["--with", NEEDED[kind]] if kind in NEEDED else []
         result = run("submit", *words)
         if result.exit_code:
             (line,) = result.stderr.splitlines()
