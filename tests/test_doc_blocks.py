@@ -53,7 +53,6 @@ NOT_RUN = {
     "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
     "drakegrasp hand new ": "a model that may not be shipped; tests/hand/test_new_hand.py",
     "drakegrasp hand check ": "tests/hand/test_tutorial_hand.py runs it",
-    "drakegrasp export OUT FOLDER --to lerobot ": "simulates again; tests/exchange/test_lerobot.py",
     "drakegrasp export OUT POSES ": "wants the package of the page; tests/test_plugin.py",
     "drakegrasp verify FILE ": "wants a file of postures; tests/cli/test_verify_request.py",
     "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols",
@@ -80,7 +79,6 @@ PY_NOT_RUN = {
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     "read_closed_grasps(out)": "an exporter of the reader; tests/test_plugin.py",
     "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
-    "lerobot.datasets": "wants LeRobot; tests/exchange/test_lerobot.py",
     "dg.SceneDataset(": "wants scenes and torch; tests/dataset/test_scene_reader.py",
     'dg.verify_grasp(grasp, "mug.obj"': "tests/test_api.py",
     'dg.place_object("mug.obj"': "tests/verification/test_verify.py",
@@ -235,8 +233,6 @@ def test_commands_of_the_docs_run(
     # `a|b|c` stands for each of them.
     words = shlex.split(line)[1:]
     choices = next((word.split("|") for word in words if "|" in word), [""])
-    # Nobody simulated this dataset, so its attempts cannot be run again.
-    choices = [choice for choice in choices if choice != "lerobot"]
     for choice in choices:
         done = run(*(choice if "|" in word else word for word in words))
         assert done.exit_code == 0, f"{LINES[line]}: {done.output}"

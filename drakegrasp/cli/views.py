@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from textwrap import fill
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -106,8 +106,6 @@ def export_samples(
     *,
     form: Annotated[str, Parameter(name="--to", metavar="FORMAT")],
     licence: Annotated[str | None, Parameter(name=("--licence", "--license"), metavar="ID")] = None,
-    attempts: Literal["samples", "failed", "all"] | None = None,
-    fps: Annotated[Count | None, Parameter(validator=Number(gte=1, lte=120))] = None,
     quiet: bool = False,
 ) -> None:
     """Write the samples of a dataset in another format.
@@ -117,16 +115,13 @@ def export_samples(
         directory: New or empty folder. [default: OUT/export_FORMAT]
         form: The format, see below.
         licence: Licence that the card of format hf names, e.g. cc-by-4.0.
-        attempts: Attempts of format lerobot: samples; failed: the hand closed, but does not hold
-            the object; all: samples, failed and held attempts. [default: samples]
-        fps: Frames per second of format lerobot. [default: 10]
         quiet: Show no progress.
     """
     from drakegrasp.exchange.export import export_dataset, options_of
     from drakegrasp.foreign_files import refuse_link
 
     # What only some formats take.
-    options = given(licence=licence, attempts=attempts, fps=fps)
+    options = given(licence=licence)
     for name, value in options.items():
         if name not in options_of(form):
             raise UsageError(f"--{name} must be left out with --to {form}, got {value}")

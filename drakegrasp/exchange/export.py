@@ -65,7 +65,7 @@ def export_dataset(
             raise DataError(f"{name} must be left out with format {form}, got {value!r}")
     for path in DATA_FILES.values():
         found = [GraspDataset(out / path, split=split, fewer_fingers=True) for split in SPLITS]
-        if options.get("attempts", "samples") == "samples" and not any(map(len, found)):
+        if not any(map(len, found)):
             raise DataError(f"{out / path}: must have samples to export, got none")
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise DataError(f"{directory}: must be a new or empty directory, got one that holds files")

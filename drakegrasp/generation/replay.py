@@ -13,26 +13,19 @@ from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.frames import Array
 from drakegrasp.generation.attempts import (
     TrialSetup,
     find_attempt,
-    predict_attempts,
     trial_rows,
     try_attempt,
 )
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.recording import record_attempt
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.scene import Scene
-from drakegrasp.simulation.scene_cache import cached_scene
-from drakegrasp.simulation.trace import Trace, traced
-from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
+from drakegrasp.simulation.trial import start_meetings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,75 +115,6 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
     _, prepared, attempt, config = _stored_trial(Path(out), trial_id)
     X_TO = prepared.resting_poses[attempt.resting]
     return record_attempt(prepared.model, X_TO, attempt, config, Path(path)).outcome
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TracedTrial:
-    """A trial that was run again, with its states over time.
-
-    Attributes:
-        model: The object.
-        attempt: The attempt.
-        config: Configuration of the object.
-        record: Record of the replay.
-        trace: States over time. They begin when geometry no longer shows that the closing fingers
-            touch nothing.
-        free: Time of closing before the first state [s].
-        q_open: (j,), positions of the joints at the start of closing [rad or m].
-    """
-
-    model: ObjectModel
-    attempt: Attempt
-    config: Config
-    record: TrialRecord
-    trace: Trace
-    free: float
-    q_open: Array
-
-
-@one_thread
-def trace_trial(out: str | Path, trial_id: int) -> TracedTrial | None:
-    """Run one trial of a dataset again, and return its states over time.
-
-    Returns:
-        The trial; None if the replay ends before the fingers have closed.
-
-    Raises:
-        DataError: If the dataset or the trial is not there.
-    """
-    _, prepared, attempt, config = _stored_trial(Path(out), trial_id)
-    setup = TrialSetup(
-        prepared=prepared,
-        config=config,
-        scene=cached_scene(prepared.model, config.physics, config.hand_source),
-    )
-    scene, X_TO = setup.scene_of(attempt), prepared.resting_poses[attempt.resting]
-    (prediction,) = predict_attempts(setup, [attempt])
-
-    def run(watched: Scene) -> TrialRecord:
-        return run_attempt(watched, X_TO, attempt, config, prediction)
-
-    record, trace = traced(scene, load_hand(config.hand_source), run)
-
-    if record.closed is None:
-        return None
-
-    # The way that geometry has skipped: the fingers begin to close when the hand is open.
-    free, q_open = 0.0, trace.q[0]
-    if prediction is not None:
-        hand = scene.hand
-        free = float((prediction.closing / hand.closing_speed).max())
-        opened = joint_positions(hand, attempt.spread, np.zeros(hand.num_fingers))
-        q_open = np.array([opened[name] for name in trace.joints])
-    return TracedTrial(
-        model=prepared.model,
-        attempt=attempt,
-        config=config,
-        record=record,
-        trace=trace,
-        free=free,
-        q_open=q_open,
-    )
 
 
 def _stored_trial(

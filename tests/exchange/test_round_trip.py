@@ -60,9 +60,9 @@ SAMPLES = (
     "filters.max_normal_angle_deg=null",
 )
 
-#: Formats of an export that only go out: contacts, meshes, pictures, scenes, or episodes, from
+#: Formats of an export that only go out: contacts, meshes, pictures or scenes, from
 #: which no posture of the hand is read.
-ONLY_OUT = {"hf", "original", "meshes", "glb", "mjcf", "lerobot"}
+ONLY_OUT = {"hf", "original", "meshes", "glb", "mjcf"}
 #: Layouts of postures that users write.
 OWN = ("npz", "hdf5", "csv", "parquet")
 
