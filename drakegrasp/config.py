@@ -143,8 +143,6 @@ class PhysicsConfig(_Section):
     link_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # other hand links [Pa]
     table_modulus: Annotated[float, Field(gt=0.0, le=1e10)] = 5e9  # [Pa], over half of its 0.1 m
     dissipation: Annotated[float, Field(ge=0.0, le=500.0)] = 20.0  # Hunt-Crossley [s/m]
-    relaxation_time: Positive = 0.02  # [s], used by the solver `sap` in place of dissipation
-    solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation
     contact_force: Positive = 0.05  # [N], a weaker contact does not count as one
     max_speed: Positive = 10.0  # [m/s], a faster object means that the simulation diverged
     # [N], largest force at the pad point of a fingertip: if one can exert more, all motors are
@@ -368,9 +366,6 @@ class RandomizeConfig(_Section):
 class ScenesConfig(_Section):
     """The scenes of scenes.hdf5 and their cameras; see docs/how-to/train-on-scenes.md."""
 
-    # "assembled" writes the file whenever a dataset is assembled, "asked" only for `drakegrasp
-    # scenes`.
-    when: Literal["asked", "assembled"] = "asked"
     place: NonNegative = 0.1  # [m] at most, of the object from T along each axis of the table
     views: Annotated[int, Field(ge=1, le=1000)] = 16  # of a training scene
     distance: Range = (0.4, 0.9)  # [m] of the camera from the point at which it looks
@@ -520,14 +515,12 @@ class Config(_Section):
     camera: CameraConfig = CameraConfig()
     randomize: RandomizeConfig = RandomizeConfig()
     scenes: Annotated[ScenesConfig, NO_SHARD] = ScenesConfig()
-    # Number of successes of an object after which it is no longer tried.
-    max_grasps: Annotated[Count | None, NO_SHARD] = None
     # Number of samples after which a build stops: of all objects together, which contribute evenly,
     # and of each object. An object may have fewer.
     samples: Annotated[Count | None, NO_SHARD] = None
     samples_per_object: Annotated[Count | None, NO_SHARD] = None
     # Number of consecutive palm poses without a sample after which an object is given up, if a
-    # number of samples or grasps is set.
+    # number of samples is set.
     samples_patience: Annotated[Count, NO_SHARD] = 400
     filters: Annotated[FilterConfig, NO_SHARD] = FilterConfig()
     split: Annotated[SplitConfig, NO_SHARD] = SplitConfig()
@@ -570,8 +563,8 @@ class Config(_Section):
 
     @property
     def has_target(self) -> bool:
-        """Whether a number of samples or grasps is set after which a build stops."""
-        return (self.samples, self.samples_per_object, self.max_grasps) != (None, None, None)
+        """Whether a number of samples is set after which a build stops."""
+        return (self.samples, self.samples_per_object) != (None, None)
 
     @property
     def code(self) -> Mapping[str, str]:

@@ -242,15 +242,12 @@ def known_work(
 
 def _target_lines(config: Config, objects: int) -> list[str]:
     """Return what ends a build with a target, and the size of the images of its samples."""
-    each, grasps = config.samples_per_object, config.max_grasps
+    each = config.samples_per_object
     ends = [counted(config.samples, "sample")] if config.samples is not None else []
     ends += [f"{counted(each, 'sample')} of each"] if each is not None else []
-    ends += [f"{counted(grasps, 'grasp')} of each"] if grasps is not None else []
     palms = counted(config.candidates.max, "palm pose")
     lines = [f"{counted(objects, 'object')}: until {' or '.join(ends)}, at most {palms} of each"]
     wanted = [n for n in (config.samples, each and objects * each) if n is not None]
-    if not wanted:
-        return lines
     # Their size on the disk depends on how well they can be compressed.
     images = [field.empty(1, {"S": config.camera.size}) for field in DATA_FIELDS if field.sample]
     size = min(wanted) * len(CAMERAS) * sum(image.nbytes for image in images)

@@ -126,13 +126,12 @@ class What:
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
         samples: Stop when all objects together have N samples; a larger N continues the build.
         samples_per_object: Stop an object when it has N samples. [default: 20, with fast and
-            without --samples, --max-grasps and --candidates]
+            without --samples and --candidates]
         candidates: Largest number of palm poses per object. [default: 10000]
         only: Build this object only; may be given several times.
         seed: Seed of all random draws. [default: 0]
         units: Unit of length of the meshes.
         quiet: Show no progress.
-        max_grasps: Stop an object after N successes. [default: no limit]
         per_class: Number of built-in objects of each class. [default: 2]
         objects_seed: Seed of the sizes of the built-in objects. [default: 0]
         manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
@@ -157,7 +156,6 @@ class What:
     seed: Count | None = None
     units: Units = "m"
     quiet: bool = False
-    max_grasps: Annotated[Count | None, Parameter(group=MORE)] = None
     per_class: Annotated[Count | None, Parameter(group=MORE)] = None
     objects_seed: Annotated[Count | None, Parameter(group=MORE)] = None
     manifest: Annotated[AnyPath | None, Parameter(group=MORE, metavar="FILE")] = None
@@ -188,7 +186,7 @@ class What:
             name = "--objects-seed" if self.per_class is None else "--per-class"
             raise UsageError(f"{name} must be used with --objects builtin, got {self.objects}")
         keys = {f"builtin.{name}": value for name, value in builtin.items()}
-        keys |= given(max_grasps=self.max_grasps, samples=self.samples, seed=self.seed)
+        keys |= given(samples=self.samples, seed=self.seed)
         keys |= given(samples_per_object=self.samples_per_object)
         keys |= given(**{"candidates.max": self.candidates})
         settings = [f"{key}={value}" for key, value in keys.items()]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import asdict
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -22,7 +21,6 @@ def assemble(
     *,
     reject: File | None = None,
     overrides: Settings = (),
-    workers: Count | None = None,
 ) -> None:
     """Filter and split again, without simulating.
 
@@ -36,7 +34,6 @@ def assemble(
         overrides: Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may
             be given several times. Your own filters must be given again:
             filters.own=FILE.py:NAME.
-        workers: Number of processes on this machine. [default: one per core]
     """
     from drakegrasp.cli import tables
     from drakegrasp.dataset.assemble import assemble as assemble_files
@@ -48,8 +45,6 @@ def assemble(
     with progress_bar("assemble", "shards") as progress:
         assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
         manifest = read_manifest(out)
-    if manifest.config.scenes.when == "assembled":
-        _write_scenes(out, workers)
     tables.print_stats(out)
     for sentence in unused_rejections(out, rejected, manifest.rejected):
         say(sentence)
@@ -77,20 +72,14 @@ def scenes(
         quiet: Show no progress.
     """
     from drakegrasp.dataset.paths import SCENES_FILE
+    from drakegrasp.generation.scenes import make_scenes
 
-    made = _write_scenes(out, workers, overrides=overrides, show=not quiet)
+    with processes(workers, "scenes", "objects", show=not quiet) as more:
+        made = make_scenes(out, overrides=overrides, **more)
     for split, row in made.items():
         say(f"{split}: {counted(row['scenes'], 'scene')}, {counted(row['views'], 'view')}")
     grasps = sum(row["grasps"] for row in made.values())
     say(f"{counted(grasps, 'grasp')} in {out / SCENES_FILE}")
-
-
-def _write_scenes(out: Path, workers: int | None, *, show: bool = True, **how: Any) -> Any:
-    """Write scenes.hdf5 in processes of this machine, and return the counts of each split."""
-    from drakegrasp.generation.scenes import make_scenes
-
-    with processes(workers, "scenes", "objects", show=show) as more:
-        return make_scenes(out, **how, **more)
 
 
 def merge(

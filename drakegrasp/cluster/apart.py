@@ -23,7 +23,6 @@ from pathlib import Path
 import psutil
 
 from drakegrasp.errors import MachineError
-from drakegrasp.runtime.executor import moved_item
 
 #: Time between two checks of the memory of the process [s].
 LOOK_SECONDS = 0.1
@@ -101,7 +100,7 @@ def _answer(request: bytes, folder: Path) -> tuple[bool, bytes]:
     """Return whether a call failed, and its pickled result or error."""
     try:
         function, item = pickle.loads(request)
-        return False, pickle.dumps(function(moved_item(item, folder)))
+        return False, pickle.dumps(function(item.moved(folder)))
     except Exception as error:
         return True, _pickled_error(error)
 

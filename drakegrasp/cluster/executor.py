@@ -15,6 +15,7 @@ interrupted while it waits, so the loss of workers would not be noticed until a 
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
@@ -188,12 +189,7 @@ class DaskExecutor:
         except (OSError, RuntimeError, TimeoutError) as error:
             raise _scheduler_lost(str(error)) from None
 
-        # Notify the observers of the pool.
-        joined, left = workers - self._workers, self._workers - workers
-        if joined or left:
-            self._workers, self.pool.size = workers, len(workers)
-            self.pool.on_change(joined, left)
-
+        self._workers, self.pool.size = workers, len(workers)
         if isinstance(self._client.cluster, PrivateCluster):
             self._client.cluster.loop.add_callback(_reopen, self._client.cluster)
         self._check_empty(now)
@@ -214,7 +210,7 @@ class DaskExecutor:
             raise MachineError(f"there has been no worker for {LOST_SECONDS:g} s; {_CONTINUES}")
         if seconds > SAY_SECONDS and not self._said:
             self._said = True
-            self.pool.on_none()
+            sys.stderr.write("there is no worker: waiting for one\n")
 
 
 def _scheduler_lost(reason: str) -> MachineError:

@@ -36,14 +36,7 @@ from distributed.utils import sync
 
 from drakegrasp.cluster.apart import ApartError, ProcessApart
 from drakegrasp.errors import MachineError
-from drakegrasp.runtime.executor import (
-    Executor,
-    FileTask,
-    processes,
-    refuse_to_start_workers,
-    run_here,
-    task_of,
-)
+from drakegrasp.runtime.executor import Executor, FileTask
 from drakegrasp.runtime.files import write_atomic
 
 T = TypeVar("T")
@@ -130,9 +123,8 @@ class _Wire:
         """Yield function(item) for every item, after the files of the task are written."""
         items = iter(items)
         first = list(islice(items, 1))
-        if not (first and isinstance(task_of(first[0]), FileTask)):
-            with _processes_here() as here:
-                yield from here(function, chain(first, items))
+        if not (first and isinstance(first[0], FileTask)):
+            yield from map(function, chain(first, items))
             return
 
         sent, numbers = dict[int, Parcel](), count()
@@ -155,7 +147,7 @@ class _Wire:
                 self._release(parcel)
 
     def _packed(self, number: int, function: Callable[[T], R], item: T) -> Parcel:
-        task = cast(FileTask, task_of(item))
+        task = cast(FileTask, item)
         return Parcel(
             number=number,
             build=self._build,
@@ -196,18 +188,6 @@ class _Wire:
                 write_atomic(self._out / place, files[place])
             else:
                 (self._out / place).unlink(missing_ok=True)
-
-
-@contextmanager
-def _processes_here() -> Iterator[Executor]:
-    """Yield an executor for the cores of this machine; one core if no process can start."""
-    try:
-        refuse_to_start_workers()
-    except MachineError:
-        yield run_here
-        return
-    with processes() as here:
-        yield here
 
 
 def _prefix(client: str) -> str:

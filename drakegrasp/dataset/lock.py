@@ -1,4 +1,4 @@
-"""The lock of a dataset's directory, which allows one build at a time, and the log of its builds.
+"""The lock of a dataset's directory, which allows one build at a time.
 
 A build holds the kernel's lock on `build.lock` in the directory, and removes the file at its end.
 The file names the process, so the message of a second build says who builds. The kernel frees the
@@ -6,22 +6,16 @@ lock of a process that dies: the next build takes the lock, and finds the name o
 
 Between machines the lock is as good as that of the file system: NFS and Lustre (mounted with
 `flock`) lock files for all machines.
-
-`log.jsonl` lists the events of the builds with their times, one line of JSON each. People and their
-tools read it. No data are derived from it, and it is the only file of a dataset that depends on the
-clock.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -130,39 +124,3 @@ def _refuse_linked_folders(out: Path) -> None:
 def unwritable(out: Path, error: OSError) -> DataError:
     """Return the error for a directory that cannot be written."""
     return DataError(f"{out}: must be a directory that can be written, got: {error.strerror}")
-
-
-LOG_FILE = "log.jsonl"
-
-
-class BuildLog:
-    """The log of a directory's builds.
-
-    Args:
-        out: Directory of the dataset.
-    """
-
-    def __init__(self, out: Path) -> None:
-        self._path = out / LOG_FILE
-
-    def __call__(self, event: str, **facts: Any) -> None:
-        """Append an event in a single write, so that a crash leaves only whole lines.
-
-        Args:
-            event: Name of the event, e.g. "unit done".
-            facts: Details of the event, as JSON types.
-
-        Raises:
-            OSError: If the file cannot be written.
-            DataError: If the file is a link.
-        """
-        now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        line = json.dumps({"time": now, "event": event, **facts}, ensure_ascii=False)
-
-        # Letters of other alphabets stay readable; control characters become escape codes.
-        line = "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in line) + "\n"
-        descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-        try:
-            os.write(descriptor, line.encode())
-        finally:
-            os.close(descriptor)

@@ -35,7 +35,7 @@ from drakegrasp.config import (
 )
 from drakegrasp.dataset.assembly.split import Home
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
-from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, LOG_FILE, unwritable
+from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, unwritable
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import (
@@ -451,7 +451,7 @@ def _refuse_other_files(out: Path) -> None:
     Raises:
         DataError: If there is such a file.
     """
-    own = (*FOLDERS, LOCK_FILE, LOG_FILE)
+    own = (*FOLDERS, LOCK_FILE)
     names = (path.name for path in out.iterdir())
     others = sorted(name for name in names if not name.startswith(".") and name not in own)
     if others:
@@ -463,8 +463,7 @@ def _refuse_other_files(out: Path) -> None:
 
 def release_directory(out: Path) -> None:
     """Remove the files of a build that produced nothing, and the directory if it is then empty."""
-    for name in (FILE_NAME, LOG_FILE):
-        (out / name).unlink(missing_ok=True)
+    (out / FILE_NAME).unlink(missing_ok=True)
     if not (out / HAND_FOLDER).is_symlink():
         shutil.rmtree(out / HAND_FOLDER, ignore_errors=True)
     # A directory with any other content existed before.

@@ -153,7 +153,7 @@ def find_keys(
     """Return the identities of the rejected attempts, sorted and each once.
 
     A key that is not a success of the dataset is left out: its object may have been removed, or
-    `max_grasps` may end before it. An id must be that of a success, since ids belong to these
+    a target may end before it. An id must be that of a success, since ids belong to these
     files.
 
     Args:

@@ -33,9 +33,8 @@ def build_config(
         part: Part of the work units to run; all if None.
 
     Raises:
-        ConfigError: If the configuration names other postures, limits both grasps and samples, or
-            names a class that cannot be used; or if its work units depend on results, so that it
-            has no parts.
+        ConfigError: If the configuration names other postures, or a class that cannot be used; or
+            if its work units depend on results, so that it has no parts.
         HandError: If the hand cannot be used, or a sampler cannot be used with it.
     """
     config = _with_postures(config, postures)
@@ -44,13 +43,9 @@ def build_config(
     if endless and rules.max == MOST_PALMS and not config.has_target:
         config = config.model_copy(update={"samples_per_object": SAMPLES_PER_OBJECT})
 
-    # At most one end, and none for a part.
-    ends = {key: getattr(config, key) for key in ("samples", "samples_per_object", "max_grasps")}
-    ends = {key: value for key, value in ends.items() if value is not None}
-    if "max_grasps" in ends and len(ends) > 1:
-        raise ConfigError("max_grasps must be null with samples or samples_per_object, got both")
-    for key, value in ends.items():
-        if part is not None:
+    for key in ("samples", "samples_per_object"):
+        value = getattr(config, key)
+        if part is not None and value is not None:
             raise ConfigError(
                 "part must be of a build with a number of palm poses (--candidates N) and no other "
                 f"end, got {key}={value}, whose work units depend on the results of all parts"

@@ -39,7 +39,7 @@ from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.runtime.progress import Report, silent
 
 #: What a build may end with. A merged dataset has none of it.
-_ENDS = ("samples", "samples_per_object", "max_grasps")
+_ENDS = ("samples", "samples_per_object")
 #: Keys in which datasets may differ. The merged dataset has the seed of the first dataset.
 _FREE = ("seed", "samples_patience", *_ENDS)
 

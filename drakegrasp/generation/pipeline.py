@@ -7,11 +7,9 @@ work unit. The order in which results arrive does not change the files.
 
 from __future__ import annotations
 
-import socket
 import sys
-import time
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +21,6 @@ from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, known_homes, survey
 from drakegrasp.dataset.card import write_card
-from drakegrasp.dataset.lock import BuildLog
 from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
@@ -31,7 +28,6 @@ from drakegrasp.dataset.manifest import (
     release_directory,
     write_manifest,
 )
-from drakegrasp.dataset.paths import FILE_NAME, SCENES_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared, with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled, palms_in_files
@@ -45,7 +41,6 @@ from drakegrasp.errors import (
 )
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation.cautions import nothing_trains, too_heavy
 from drakegrasp.generation.counts import Counts
 from drakegrasp.generation.directory import BuildDirectory
 from drakegrasp.generation.prepare import (
@@ -56,7 +51,6 @@ from drakegrasp.generation.prepare import (
     prepare_one,
 )
 from drakegrasp.generation.request import Part
-from drakegrasp.generation.scenes import make_scenes_locked
 from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import (
     UnitSummary,
@@ -137,19 +131,11 @@ def build(
         DiskFullError: If the disk is full; the same call continues when there is space.
         MachineError: If the workers cannot do the work.
     """
-    job = _Build(directory, execute, postures, part, pool, show=show)
-    try:
-        return job.run(sources)
-    except BaseException as error:
-        # Log why the build stopped; an error of the log must not hide this error.
-        with suppress(OSError, DataError):
-            if (directory.out / FILE_NAME).exists():
-                job.log("stopped", reason=f"{type(error).__name__}: {error}")
-        raise
+    return _Build(directory, execute, postures, part, pool, show=show).run(sources)
 
 
 class _Build:
-    """The steps of a build and their common data; `log` writes events, see `BuildLog`."""
+    """The steps of a build and their common data."""
 
     def __init__(
         self,
@@ -166,7 +152,6 @@ class _Build:
         self._config = directory.manifest.config
         self._execute, self._pool, self._show = execute, pool, show
         self._postures, self._part = postures, part
-        self.log = BuildLog(self._out)
 
         # With a target: the palm poses that the dataset had of each object, the grasps that are no
         # samples by inspection, the successes of each completed unit, and the last survey of them.
@@ -177,21 +162,15 @@ class _Build:
 
     def run(self, sources: Sequence[MeshSource]) -> BuildReport:
         """Prepare, simulate, assemble."""
-        start = time.monotonic()
-
         # Write the manifest first, because a directory without a manifest holds no dataset.
         write_manifest(self._manifest, self._out)
-        self._begin()
-        self._warn(nothing_trains(sources, self._config.split))
-
         # Prepare each object, or reject its mesh.
         with self._progress("prepare", "objects") as report:
             self._prepare(sources, report)
-        self._warn(too_heavy(self._manifest))
         if self._postures is not None:
             table = self._postures
             for told in filter(None, (_refused(table, self._manifest), table.nameless, table.bare)):
-                self._warn(told)
+                self._say(told)
                 self._notices.append(told)
 
         # Simulate the missing work units; remove the temporary files of killed workers.
@@ -214,9 +193,8 @@ class _Build:
             self._notices.append(f"{shards}: damaged, and simulated again")
         unexplained = tuple(counts.unexplained())
         for line in unexplained:
-            self._warn(line)
+            self._say(line)
         done = {"simulated": counts.simulated, "reused": counts.reused}
-        self.log("finished", **done, seconds=round(time.monotonic() - start, 3))
         return BuildReport(
             out=self._out,
             **done,
@@ -228,40 +206,6 @@ class _Build:
             assembled=assembled,
             assembly=None if left else summarise(self._out),
         )
-
-    # What people see
-
-    def _begin(self) -> None:
-        """Log the start of the build, and observe the workers."""
-        self.log(
-            "started",
-            command=sys.argv,
-            host=socket.gethostname(),
-            config_hash=self._config.simulation_hash(),
-            seed=self._config.seed,
-            versions=self._manifest.versions,
-        )
-        for notice in self._notices:
-            self.log("notice", text=notice)
-        if self._pool is not None:
-            self._pool.on_change = self._workers_changed
-            self._pool.on_none = self._no_worker
-
-    def _workers_changed(self, joined: set[str], left: set[str]) -> None:
-        assert self._pool is not None
-        for event, addresses in (("worker joined", joined), ("worker lost", left)):
-            for address in sorted(addresses):
-                self.log(event, address=address, workers=self._pool.size)
-
-    def _no_worker(self) -> None:
-        self.log("no worker")
-        self._say("there is no worker: waiting for one")
-
-    def _warn(self, text: str) -> None:
-        """Log and print a warning for the user, unless it is empty."""
-        if text:
-            self.log("notice", text=text)
-            self._say(text)
 
     def _say(self, text: str) -> None:
         if self._show:
@@ -305,11 +249,6 @@ class _Build:
         ]
         for name, entry in self._execute(prepare_one, tasks):
             entries[name] = entry
-            if isinstance(entry, RefusedMesh):
-                self.log("mesh refused", name=name, reason=entry.reason)
-            else:
-                facts = {"candidates": entry.candidates, "notes": list(entry.notes)}
-                self.log("mesh prepared", name=name, **facts)
             report(len(entries), len(sources), found=reused)
 
         # If a mesh has changed, its rows and its rejected grasps no longer exist.
@@ -363,15 +302,6 @@ class _Build:
         if target is not None:
             _set_units(target, manifest)
 
-        # The progress bar shows the number of workers as it changes.
-        if self._pool is not None:
-
-            def change(joined: set[str], left: set[str]) -> None:
-                self._workers_changed(joined, left)
-                counts.show()
-
-            self._pool.on_change = change
-
         # Count the units of earlier builds, which are reused.
         done = set[ShardHeader]()
         find = partial(find_units, self._out, config)
@@ -379,9 +309,7 @@ class _Build:
             for summary in units:
                 done.add(summary.header)
                 self._add(summary, counts, target, reused=True)
-            for path, reason in damaged:
-                counts.damaged.append(path)
-                self.log("damaged shard", reason=reason)
+            counts.damaged += damaged
         counts.show()  # the first unit may take a minute
 
         if target is not None:
@@ -435,7 +363,7 @@ class _Build:
     def _outliers(self, manifest: Manifest) -> dict[str, int]:
         """Return how many samples of each object the filter of outliers removes."""
         filters, names = self._config.filters, [entry.name for entry in manifest.objects]
-        if filters.outlier_sigma == 0.0 or self._config.max_grasps is not None:
+        if filters.outlier_sigma == 0.0:
             return {}
         if not manifest.units:
             return {}
@@ -461,15 +389,6 @@ class _Build:
 
         for summary in self._execute(run_unit, units):
             self._add(summary, counts, target)
-            self.log(
-                "unit done",
-                object=summary.header.object_name,
-                start=summary.header.start,
-                stop=summary.header.stop,
-                outcomes={outcome.label: count for outcome, count in summary.outcomes.items()},
-                seconds={stage: round(seconds, 4) for stage, seconds in summary.seconds.items()},
-                errors=summary.errors,
-            )
 
     def _add(
         self, summary: UnitSummary, counts: Counts, target: Target | None, *, reused: bool = False
@@ -500,10 +419,6 @@ class _Build:
                 assemble_locked(out, self._manifest, surveyed=surveyed, progress=report)
         else:
             write_card(out)  # the licence of a mesh may have changed
-        scenes = self._config.scenes.when == "assembled"
-        if scenes and (stale or not (out / SCENES_FILE).is_file()):
-            with self._progress("scenes", "objects") as report:
-                make_scenes_locked(out, execute=self._execute, progress=report)
         return stale
 
 

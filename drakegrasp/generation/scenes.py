@@ -26,7 +26,7 @@ from drakegrasp.dataset.hdf5 import AnyArray, create_field, packed_chunk, write_
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
 from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
-from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE, object_files
+from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, count_scenes, grasps_of_trials
 from drakegrasp.dataset.schema import (
@@ -43,7 +43,6 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
 from drakegrasp.generation.attempts import find_attempt
-from drakegrasp.generation.tasks import DatasetTask
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.parsing import position_order
@@ -97,17 +96,15 @@ def make_scenes(
     """
     read_manifest(out)  # fails for a missing directory, which the lock would create
     with build_lock(out):
-        return make_scenes_locked(out, overrides=overrides, execute=execute, progress=progress)
+        counts = _make_scenes(out, overrides, execute, progress)
+        write_card(out)
+        return counts
 
 
-def make_scenes_locked(
-    out: Path,
-    *,
-    overrides: Sequence[str] = (),
-    execute: Executor = run_here,
-    progress: Report = silent,
+def _make_scenes(
+    out: Path, overrides: Sequence[str], execute: Executor, progress: Report
 ) -> dict[str, dict[str, int]]:
-    """Write scenes.hdf5 and the card, see `make_scenes`; the caller holds the lock."""
+    """Write scenes.hdf5, see `make_scenes`; the caller holds the lock."""
     manifest = read_manifest(out)
     config = _with_scenes(manifest.config, overrides)
     hand = load_hand(config.hand_source)
@@ -136,9 +133,7 @@ def make_scenes_locked(
             progress(done, count)
         for group, parts in tables.items():
             _write_table(file, group, parts)
-        counts = count_scenes(file)
-    write_card(out)
-    return counts
+        return count_scenes(file)
 
 
 def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
@@ -260,10 +255,12 @@ Columns = dict[str, AnyArray]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SceneTask(DatasetTask):
+class SceneTask:
     """The input of a task that creates the scenes of an object; its result are the scenes.
 
     Attributes:
+        out: Directory of the dataset.
+        config: Configuration of the dataset.
         name: Name of the object.
         split: Split of the scenes, as an index into SPLITS.
         joints: Names of the hand's joints, in the order of the files.
@@ -271,21 +268,13 @@ class SceneTask(DatasetTask):
         samples: (n,), which of these rows are samples.
     """
 
+    out: Path
+    config: Config
     name: str
     split: int
     joints: Sequence[str]
     trials: Columns
     samples: AnyArray
-
-    @property
-    def inputs(self) -> tuple[Path, ...]:
-        """The files of the prepared object."""
-        return object_files(self.out, self.name)
-
-    @property
-    def outputs(self) -> tuple[Path, ...]:
-        """No files."""
-        return ()
 
 
 @one_thread

@@ -1,9 +1,9 @@
 """The target of a build: how many palm poses of each object the dataset takes.
 
-A target is a number of samples in all (`samples`), of each object (`samples_per_object`), or of
-grasps of each object (`max_grasps`). Input: the palm poses whose attempts were hits (samples, or
-grasps), as work units end, in any order. Output: the units that are still needed, and in the end
-the number of palm poses of each object after which its rows end.
+A target is a number of samples in all (`samples`), or of each object (`samples_per_object`). Input:
+the palm poses whose attempts were hits (samples), as work units end, in any order. Output: the
+units that are still needed, and in the end the number of palm poses of each object after which its
+rows end.
 
 The samples are spread evenly: every object contributes up to one level, which rises where others
 are exhausted. The result follows from the hits alone, not from the order or the number of units
@@ -113,8 +113,8 @@ class Target:
         """Begin without any palm poses.
 
         Args:
-            config: Configuration, whose `samples`, `samples_per_object`, `max_grasps` and
-                `samples_patience` define the target.
+            config: Configuration, whose `samples`, `samples_per_object` and `samples_patience`
+                define the target.
             floors: Number of palm poses of each object that the dataset already has, by name.
         """
         self._config = config
@@ -153,7 +153,7 @@ class Target:
     @property
     def wanted(self) -> int:
         """Number of hits at which the build ends, if every object yields its share."""
-        each = self._config.samples_per_object or self._config.max_grasps
+        each = self._config.samples_per_object
         of_all = inf if each is None else each * len(self._objects)
         return int(min(of_all, inf if self._config.samples is None else self._config.samples))
 
@@ -215,7 +215,6 @@ class Target:
     def warnings(self) -> list[str]:
         """Return lines that state which part of the target was not reached, and what is uneven."""
         config, lines = self._config, list[str]()
-        what = "grasps" if config.max_grasps is not None else "samples"
         counts, spent, vain = dict[str, int](), list[str](), list[str]()
         shares = self._even_shares(whole=True)
         for name, taken in self._taken(shares).items():
@@ -226,7 +225,7 @@ class Target:
                 (spent if item.given_up is None else vain).append(name)
         total = sum(counts.values())
         if config.samples is not None and total < config.samples:
-            lines.append(f"{total:,} of {config.samples:,} {what} were found")
+            lines.append(f"{total:,} of {config.samples:,} samples were found")
         if config.samples is None or total < config.samples:
             for names, why in (
                 (vain, f"given up after {config.samples_patience} palm poses without one"),
@@ -234,7 +233,7 @@ class Target:
             ):
                 if names:
                     said = listed([f"{name} ({counts[name]:,})" for name in names])
-                    lines.append(f"too few {what}, {why}: {said}")
+                    lines.append(f"too few samples, {why}: {said}")
 
         # A few objects may have to make up for the others.
         share = self.wanted / max(len(counts), 1)
@@ -243,7 +242,7 @@ class Target:
         if large and all(item.end is not None for item in fewer):
             said = listed([f"{name} ({counts[name]:,})" for name in large])
             lines.append(
-                f"more than twice their share of {share:.3g} {what}, because the other objects "
+                f"more than twice their share of {share:.3g} samples, because the other objects "
                 f"yielded no more: {said}"
             )
         return lines
@@ -269,7 +268,7 @@ class Target:
         if any(item.known < item.floor for item in self._objects.values()):
             return dict.fromkeys(self._objects, 0)
         wanted = self._config.samples
-        each = self._config.samples_per_object or self._config.max_grasps or wanted or 0
+        each = self._config.samples_per_object or wanted or 0
         shares = {name: each + lost for name, lost in self._lost.items()}
         if wanted is None:
             return shares

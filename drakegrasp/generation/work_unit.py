@@ -39,7 +39,7 @@ from drakegrasp.generation.attempts import (
 )
 from drakegrasp.generation.tasks import DatasetTask
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.environment import one_thread, timed, trim_memory
+from drakegrasp.runtime.environment import one_thread, trim_memory
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import (
     ATTEMPT,
@@ -106,8 +106,6 @@ class UnitSummary:
     Attributes:
         header: Header of the unit.
         outcomes: Number of attempts by outcome.
-        seconds: Wall-clock time by stage (`build`, `try`, `measure`, `look`, `repeat` if there are
-            repeats, `write`) [s]; for logs only. Empty if the shard existed already.
         errors: Number of solver errors by message.
         successes: The successes with what filters need of each, see `successes_by_rule`; None
             without a target.
@@ -117,7 +115,6 @@ class UnitSummary:
 
     header: ShardHeader
     outcomes: dict[Outcome, int]
-    seconds: dict[str, float]
     errors: dict[str, int]
     successes: Table | None = None
     hits: tuple[tuple[int, int], ...] = ()
@@ -157,7 +154,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
 
 
 class _Experiment:
-    """The attempts of a unit, with the journal and the times of its steps."""
+    """The attempts of a unit, with the journal of its steps."""
 
     def __init__(self, unit: WorkUnit, journal: Journal) -> None:
         """Build the object's scene, or use that of the previous unit, and list the attempts.
@@ -166,7 +163,6 @@ class _Experiment:
             MachineError: If the process died repeatedly in this unit.
         """
         self._unit, self._config, self._journal = unit, unit.config, journal
-        self._seconds: dict[str, float] = {}
         self._errors: Counter[str] = Counter()
         header = unit.header
         if journal.in_crash_loop:
@@ -175,7 +171,7 @@ class _Experiment:
                 f"died {GIVE_UP_DEATHS} times in a row in this work unit; is there enough memory? "
                 "The same command continues from here"
             )
-        with self._stage("build"):
+        with self._step("build"):
             self._setup = self._build_setup()
             indices = range(header.start, header.stop)
             self._attempts = list_attempts(self._setup.prepared, indices, self._config)
@@ -184,14 +180,13 @@ class _Experiment:
         """Run the attempts, and write the shard, either completely or not at all."""
         header = self._unit.header
         records = self._try_all()
-        with self._stage("measure"):
+        with self._step("measure"):
             trials = trial_rows(self._setup, self._attempts, records)
         looks = self._looks(records)
         if self._config.robustness.repeats:
-            with timed(self._seconds, "repeat"):
-                trials |= self._repeats(records)
+            trials |= self._repeats(records)
 
-        with self._stage("write"):
+        with self._step("write"):
             shard = Shard(header=header, trials=trials, looks={**looks})
             write_shard(self._unit.out, shard)
         rows = Table(trials)[looks["row"]]
@@ -199,7 +194,6 @@ class _Experiment:
         return UnitSummary(
             header=header,
             outcomes=count_outcomes(trials["outcome"]),
-            seconds=self._seconds,
             errors=dict(self._errors),
             **_judged(rows, self._config),
         )
@@ -221,12 +215,6 @@ class _Experiment:
         with self._journal.step(step, STAGE_SECONDS):
             yield
 
-    @contextmanager
-    def _stage(self, step: str) -> Iterator[None]:
-        """Run and time a stage that is one step, see `_step`."""
-        with timed(self._seconds, step), self._step(step):
-            yield
-
     def _build_setup(self) -> TrialSetup:
         header = self._unit.header
         try:
@@ -243,16 +231,15 @@ class _Experiment:
         an attempt that crashes is found at once.
         """
         attempts = self._attempts
-        with timed(self._seconds, "try"):
-            # The first call computes the object's distance field.
-            with self._step("predict"):
-                inject_fault(self._unit.header.object_name, "predict")
-                predictions = predict_attempts(self._setup, attempts)
-            steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
-            unresolved = set(self._journal.unresolved)
-            records = dict[int, TrialRecord]()
-            for row in sorted(range(len(steps)), key=lambda row: steps[row] not in unresolved):
-                records[row] = self._try(attempts[row], predictions[row], steps[row])
+        # The first call computes the object's distance field.
+        with self._step("predict"):
+            inject_fault(self._unit.header.object_name, "predict")
+            predictions = predict_attempts(self._setup, attempts)
+        steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
+        unresolved = set(self._journal.unresolved)
+        records = dict[int, TrialRecord]()
+        for row in sorted(range(len(steps)), key=lambda row: steps[row] not in unresolved):
+            records[row] = self._try(attempts[row], predictions[row], steps[row])
         ordered = [records[row] for row in range(len(attempts))]
         self._errors.update(record.message for record in ordered if record.message)
         return ordered
@@ -272,13 +259,12 @@ class _Experiment:
         """Return the rows of `/looks`, with the images of both cameras of every success."""
         rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
         looks = {f.name: f.empty(len(rows), self._setup.sizes) for f in LOOK_FIELDS}
-        with timed(self._seconds, "look"):
-            for k, row in enumerate(rows):
-                looks["row"][k] = row
-                with self._step(f"look {row}"):
-                    look = look_at(self._setup, self._attempts[row], records[row].X_TO)
-                for name, value in look.items():
-                    looks[name][k] = value
+        for k, row in enumerate(rows):
+            looks["row"][k] = row
+            with self._step(f"look {row}"):
+                look = look_at(self._setup, self._attempts[row], records[row].X_TO)
+            for name, value in look.items():
+                looks[name][k] = value
         return Table(looks)
 
     def _repeats(self, records: Sequence[TrialRecord]) -> dict[str, AnyArray]:
@@ -332,7 +318,7 @@ def _find_unit(out: Path, header: ShardHeader, config: Config) -> UnitSummary | 
     with open_shard(path, header) as (file, _):
         outcomes = count_outcomes(file["trials/outcome"][:])
         judged = _judged(shard_successes(file), config) if config.has_target else {}
-    return UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}, **judged)
+    return UnitSummary(header=header, outcomes=outcomes, errors={}, **judged)
 
 
 def _judged(rows: Table, config: Config) -> dict[str, Any]:
@@ -361,24 +347,24 @@ def find_tasks(out: Path, manifest: Manifest) -> Iterator[tuple[ShardHeader, ...
 
 def find_units(
     out: Path, config: Config, headers: Sequence[ShardHeader]
-) -> tuple[list[UnitSummary], list[tuple[str, str]]]:
+) -> tuple[list[UnitSummary], list[str]]:
     """Find an object's completed units in a dataset.
 
     The folder is listed once, and the seals of its shards are verified. A build that continues runs
     this in all its workers.
 
     Returns:
-        The summaries of the work units with a valid shard, and for each damaged shard its path
-        within the dataset and what is wrong with it.
+        The summaries of the work units with a valid shard, and the paths of damaged shards within
+        the dataset.
     """
-    done, damaged = list[UnitSummary](), list[tuple[str, str]]()
+    done, damaged = list[UnitSummary](), list[str]()
     names = set(os.listdir(shards_folder(out, headers[0].object_name)))
     for header in headers:
         # Open only files that are listed.
         try:
             found = _find_unit(out, header, config) if header.file_name in names else None
-        except DataError as error:
-            damaged.append((str(header.path(out).relative_to(out)), str(error)))
+        except DataError:
+            damaged.append(str(header.path(out).relative_to(out)))
             found = None
         if found is None:
             continue

@@ -22,7 +22,7 @@ from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar, runtime_checkable
+from typing import Protocol, Self, TypeVar, runtime_checkable
 
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.runtime.environment import available_cores
@@ -66,13 +66,9 @@ class WorkerPool:
 
     Attributes:
         size: Current number of workers.
-        on_change: Called with the addresses of workers that joined and of workers that left.
-        on_none: Called once if there has been no worker for a long time and the work waits for one.
     """
 
     size: int = 0
-    on_change: Callable[[set[str], set[str]], None] = lambda joined, left: None
-    on_none: Callable[[], None] = lambda: None
 
 
 def run_here(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -109,17 +105,6 @@ def _numbered(function: Callable[[T], R], item: tuple[int, T]) -> tuple[int, R]:
     """Return the number of an item and its result."""
     number, argument = item
     return number, function(argument)
-
-
-def task_of(item: Any) -> Any:
-    """Return the task in an item of an executor, which `in_order` has given a number."""
-    return item[1] if isinstance(item, tuple) else item
-
-
-def moved_item(item: Any, folder: Path) -> Any:
-    """Return an item whose task is a `FileTask` in a directory with copies of the files."""
-    task = task_of(item).moved(folder)
-    return (item[0], task) if isinstance(item, tuple) else task
 
 
 def count_workers(workers: int | None, name: str = "workers") -> int:

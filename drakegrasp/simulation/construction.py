@@ -175,7 +175,7 @@ def _draft(
     config = MultibodyPlantConfig(
         time_step=physics.time_step,
         contact_model="hydroelastic_with_fallback",
-        discrete_contact_approximation=physics.solver,
+        discrete_contact_approximation="lagged",
         # Sampled ports would report the contacts of the previous step.
         use_sampled_output_ports=False,
     )
@@ -363,7 +363,6 @@ def _add_material(properties: ProximityProperties, mu: float, physics: PhysicsCo
         friction=CoulombFriction(mu, mu),
         properties=properties,
     )
-    properties.AddProperty("material", "relaxation_time", physics.relaxation_time)
 
 
 def _assign_proximity(

@@ -51,7 +51,6 @@ OUT/
   grasping_otm.hdf5        the same samples; up in the image is up in the world
   scenes.hdf5              views that do not depend on a grasp, and all closed hands; on request
   DATACARD.md, .json       content, settings, counts, licences and known limits of the dataset
-  log.jsonl                events of the build with their times: one line of JSON per event
   reject.json              grasps that an inspection rejects; only if there are any
   build.lock               process that builds; only while a build runs
 ```

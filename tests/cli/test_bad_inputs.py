@@ -44,7 +44,7 @@ _BUILD = (
 #: Commands by their names in the table.
 COMMANDS: dict[str, tuple[str, ...]] = {
     "stats": ("stats", "{out}"),
-    "assemble": ("assemble", "{out}", "--workers", "1"),
+    "assemble": ("assemble", "{out}"),
     "check": ("check", "{out}", "--workers", "1"),
     "check FILE": ("check", "{out}/{file}", "--workers", "1"),
     "replay": ("replay", "{out}", "--trial", "0"),
@@ -349,7 +349,7 @@ def test_cameras(base: Path, tmp_path: Path, share: int) -> None:
 
 def test_decisions(base: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(base / "out", tmp_path / "out"))
-    before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file} --workers 1"
+    before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file}"
     sound = (base / REJECT).read_bytes()
     walk_file(base, tmp_path, sound, ".json", manifests.DECISIONS, command)
     kinds = manifests.REJECTED_IDS
@@ -422,7 +422,6 @@ def test_options(base: Path, tmp_path: Path, option: str) -> None:
 #: How the lines about some options call them.
 NAMES_OF_OPTIONS = (
     "candidates.max",
-    "max_grasps",
     "hand",
     "config",
     "builtin.",

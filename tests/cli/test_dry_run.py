@@ -89,7 +89,6 @@ def test_dry_run_of_postures_counts_those_that_can_be_tried(tmp_path: Path) -> N
         (("--only", "1_jug_1"), "only must be names of objects"),
         (("--part", "3/2"), "part must be I/N"),
         (("--part", "1/2", "--samples", "3"), "part must be of a build with a number"),
-        (("--samples", "3", "--max-grasps", "3"), "max_grasps must be null"),
         (("--set", "candidates.postures=0123456789abcdef"), "candidates.postures must be"),
     ],
 )

@@ -16,7 +16,6 @@ from helpers.commands import run
 from helpers.datasets import OTO, TRIALS, edit_manifest
 
 from drakegrasp.api.building import build_dataset
-from drakegrasp.dataset.lock import BuildLog
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
@@ -54,18 +53,10 @@ def test_assemble_says_that_the_hand_is_another_one_and_the_card_leaves_it_out(o
     carry_hand(out, read_manifest(out).config)
     with (out / "hand" / "barrett_hand.yaml").open("a") as file:
         file.write("# changed\n")
-    said = run("assemble", out, "--workers", "1").stdout.splitlines()
+    said = run("assemble", out).stdout.splitlines()
     assert said[-1].startswith("hand: the hand must be that of manifest.json, ")
     settings = json.loads((out / "DATACARD.json").read_text())["settings"]
     assert settings["lift.drive"] == "that of the hand file"
-
-
-def test_log_that_is_a_link_is_not_written(out: Path, tmp_path: Path) -> None:
-    victim = tmp_path / "profile"
-    (out / "log.jsonl").symlink_to(victim)
-    with pytest.raises(DataError, match="must be a file of its own, got a link"):
-        BuildLog(out)("mesh prepared", name="$(touch me)")
-    assert not victim.exists()
 
 
 @pytest.mark.parametrize("folder", ["shards", "shards/1_box_a", "objects", "builtin"])
@@ -228,12 +219,7 @@ def test_paths_and_names_of_files_do_not_steer_the_terminal(tmp_path: Path) -> N
         assert not set("\x1b\x07\x9b") & set(said)
 
 
-def test_names_in_a_log_and_on_a_page_steer_nothing(tmp_path: Path) -> None:
-    BuildLog(tmp_path)("mesh refused", name=f"é{STEERING}")
-    text = (tmp_path / "log.jsonl").read_text(encoding="utf-8")
-    assert "é" in text
-    assert not set("\x1b\x07\x9b") & set(text)
-    assert json.loads(text)["name"] == f"é{STEERING}"
+def test_names_on_a_page_steer_nothing() -> None:
     page = TEMPLATES.from_string("<p>{{ name }}</p>").render(name=f"<é{STEERING}>")
     assert page == "<p>&lt;é\\x1b]0;x\\x07\\x9b31m&gt;</p>"
 

@@ -10,10 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.commands import run
 
 from drakegrasp.dataset.card import card_content
-from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.errors import ConfigError
@@ -132,19 +130,3 @@ def test_by_class_no_object_is_in_two_splits(
     split = manifest.config.split.model_copy(update={"by": "class", "valid_fraction": 0.0})
     manifest = replace(manifest, config=manifest.config.model_copy(update={"split": split}))
     assert split_objects(manifest, present) == splits
-
-
-def test_assemble_makes_them_where_the_configuration_says_so(out: Path) -> None:
-    arguments = ["assemble", str(out), "--workers", "1"]
-    assert run(*arguments).exit_code == 0
-    assert not (out / "scenes.hdf5").exists()
-    settings = ("scenes.when=assembled", "scenes.views=2", *SMALL_IMAGES)
-    wanted = [word for text in settings for word in ("--set", text)]
-    assert run(*arguments, *wanted).exit_code == 0
-    assert check_dataset(out) == []
-    with h5py.File(out / "scenes.hdf5") as file:
-        assert len(file["views/scene"]) == 2 + 2 * 5
-    # The next one, which is made of the same manifest, makes them again.
-    (out / "scenes.hdf5").unlink()
-    assert run(*arguments).exit_code == 0
-    assert (out / "scenes.hdf5").exists()

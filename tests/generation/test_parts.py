@@ -32,8 +32,8 @@ TINY = [
 
 
 def content(out: Path) -> dict[str, bytes]:
-    """Return the files of a dataset but for its log."""
-    files = (path for path in out.rglob("*") if path.is_file() and path.name != "log.jsonl")
+    """Return the files of a dataset."""
+    files = (path for path in out.rglob("*") if path.is_file())
     return {path.relative_to(out).as_posix(): path.read_bytes() for path in files}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -239,26 +238,6 @@ def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
     assert not any("2_house_a" in e.reason or "3_text_a" in e.reason for e in report.refused)
     again = build(find_meshes(meshes), out, config, _nothing_runs, show=False)
     assert again.refused == report.refused
-
-
-def test_a_build_that_trains_nothing_says_so_before_it_prepares(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    meshes, out = tmp_path / "meshes", tmp_path / "out"
-    meshes.mkdir()
-    trimesh.creation.box([0.06, 0.06, 0.09]).export(meshes / "1_box_a.obj")
-
-    def stop(*_: object) -> Iterator[object]:
-        raise KeyboardInterrupt
-
-    for show in (True, False):
-        with pytest.raises(KeyboardInterrupt):
-            build(find_meshes(meshes), out, load_config("paper"), stop, show=show)
-        said = capsys.readouterr().err
-        assert ("nothing will train: every class has one object" in said) is show
-    events = map(json.loads, (out / "log.jsonl").read_text().splitlines())
-    notices = [event["text"] for event in events if event["event"] == "notice"]
-    assert [text.partition(":")[0] for text in notices] == ["nothing will train"] * 2
 
 
 def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:

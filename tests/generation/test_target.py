@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 import pytest
 
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.errors import ConfigError
-from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.target import Target
 from drakegrasp.hand.settings import load_config
 
@@ -98,7 +96,7 @@ def test_result_does_not_depend_on_the_number_of_workers() -> None:
     assert [run(make_target(samples=25), workers) for workers in (2, 3, 8)] == 3 * [alone]
 
 
-@pytest.mark.parametrize("ends", [{"samples_per_object": 4}, {"samples": 40}, {"max_grasps": 7}])
+@pytest.mark.parametrize("ends", [{"samples_per_object": 4}, {"samples": 40}])
 @pytest.mark.parametrize("workers", [3, 30])
 def test_result_does_not_depend_on_units_that_were_run_in_vain(
     ends: dict[str, int], workers: int
@@ -240,9 +238,3 @@ def test_samples_that_the_filter_of_outliers_removes_are_made_up_for() -> None:
     found = samples(run(target))
     assert sum(found.values()) == 14
     assert not target.lose({"rich": 1})
-
-
-def test_grasps_and_samples_cannot_both_end_a_build() -> None:
-    config = load_config(max_grasps=3, samples=4)
-    with pytest.raises(ConfigError, match="max_grasps must be null with samples"):
-        build_config(config)

@@ -109,7 +109,7 @@ def test_mass_density_and_friction_of_the_mesh_win(tmp_path):
         np.testing.assert_allclose(model.I_OOcm_O, mass * plain.I_OOcm_O, rtol=1e-9, atol=1e-12)
     rough, physics = prepare_object(source(path, friction=1.2)), load_config().physics
     own = rough.own_physics(physics)
-    assert (own.friction_hand, own.friction_table, own.solver) == (1.2, 1.2, physics.solver)
+    assert own == physics.model_copy(update={"friction_hand": 1.2, "friction_table": 1.2})
     assert plain.own_physics(physics) is physics
     save_object(rough, tmp_path / "rough.npz")
     assert load_object(tmp_path / "rough.npz").friction == 1.2

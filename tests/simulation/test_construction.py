@@ -71,7 +71,6 @@ def test_materials_are_the_configured_ones(cone: ObjectModel, config: Config, ha
         config,
         [
             "physics.dissipation=3.5",
-            "physics.relaxation_time=0.07",
             "physics.fingertip_modulus=2.5e5",
             "physics.link_modulus=3.5e6",
             "physics.table_modulus=4.5e6",
@@ -91,24 +90,18 @@ def test_materials_are_the_configured_ones(cone: ObjectModel, config: Config, ha
         *((tip, 2.5e5, held) for tip in scene.fingertips),
     ):
         assert set(properties(scene, body, "material", "hunt_crossley_dissipation")) == {3.5}
-        assert set(properties(scene, body, "material", "relaxation_time")) == {0.07}
         for found in properties(scene, body, "material", "coulomb_friction"):
             assert found.static_friction() == found.dynamic_friction() == pytest.approx(friction)
         if modulus is not None:
             assert set(properties(scene, body, "hydroelastic", "hydroelastic_modulus")) == {modulus}
 
 
-@pytest.mark.parametrize("solver", ["sap", "similar", "lagged"])
-def test_solver_and_step_are_the_configured_ones(
-    cone: ObjectModel, config: Config, hand: Hand, solver: str
-) -> None:
-    physics = override_config(
-        config, [f"physics.solver={solver}", "physics.time_step=0.003", "physics.coarse_steps=4"]
-    ).physics
+def test_steps_are_the_configured_ones(cone: ObjectModel, config: Config, hand: Hand) -> None:
+    physics = override_config(config, ["physics.time_step=0.003", "physics.coarse_steps=4"]).physics
     scene = build_scene(cone, physics, hand)
     assert scene.coarse_scene is not None
     for plant, step in ((scene.plant, 0.003), (scene.coarse_scene().plant, 0.012)):
-        expected = DiscreteContactApproximation.__members__[f"k{solver.capitalize()}"]
+        expected = DiscreteContactApproximation.kLagged
         assert plant.get_discrete_contact_approximation() == expected
         assert plant.time_step() == pytest.approx(step)
 

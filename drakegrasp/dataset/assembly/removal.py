@@ -131,11 +131,9 @@ def successes_by_rule(rows: Table, config: Config) -> Table:
 def find_hits(successes: Table, config: Config) -> tuple[tuple[int, int], ...]:
     """Return the candidates and stand-offs of the successes that count for a target.
 
-    These are all with `max_grasps`, and otherwise those that pass all filters except the one of
-    outliers, which needs all grasps of an object.
+    They pass all filters except the one of outliers, which needs all grasps of an object.
     """
-    if config.max_grasps is None:
-        filters = config.filters.model_copy(update={"outlier_sigma": 0.0})
-        successes = successes[judge_successes(successes, filters) == Removal.KEPT]
+    filters = config.filters.model_copy(update={"outlier_sigma": 0.0})
+    successes = successes[judge_successes(successes, filters) == Removal.KEPT]
     names = ("candidate", "standoff_index")
     return tuple(zip(*(successes[name].tolist() for name in names), strict=True))
