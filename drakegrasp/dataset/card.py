@@ -154,7 +154,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "fingers": list(manifest.fingers),
         "joints": list(manifest.joints),
         "schema_version": SCHEMA_VERSION,
-        "seeds": sorted({entry.config_in(config).seed for entry in entries}),
+        "seed": config.seed,
         "config_hash": config.simulation_hash(),
         "settings": _settings(config, hand),
         "split_by": rule,
@@ -342,10 +342,9 @@ def _files(content: Mapping[str, Any]) -> str:
 def _how(content: Mapping[str, Any]) -> str:
     settings = _table(("setting", "value"), [(f"`{k}`", v) for k, v in content["settings"].items()])
     versions = ", ".join(f"{name} {version}" for name, version in content["versions"].items())
-    seeds = ", ".join(map(str, content["seeds"]))
     return f"""## How it was made
 
-Schema {content["schema_version"]}, seed {seeds}, configuration
+Schema {content["schema_version"]}, seed {content["seed"]}, configuration
 `{content["config_hash"]}`.
 
 {settings}

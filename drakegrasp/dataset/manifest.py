@@ -29,7 +29,6 @@ from drakegrasp.config import (
     NonNegativeCount,
     Number,
     Positive,
-    Seed,
     Share,
     parse_stored,
 )
@@ -126,9 +125,6 @@ class ObjectEntry:
         split: Split of the object in a split by object, once it has samples; None before.
         group: Name shared by objects of the same mesh, which stay in one split; None: the object's
             name.
-        seed: Seed of the object's draws, in a merged dataset; None: the configuration's seed.
-        drawn_as: Name of the object in its files, if a merged dataset has the mesh under several
-            seeds; None: the object's name.
     """
 
     name: Name
@@ -148,17 +144,6 @@ class ObjectEntry:
     ended: bool = False
     split: Home | None = None
     group: Name | None = None
-    seed: Seed | None = None
-    drawn_as: Name | None = None
-
-    @property
-    def mesh_name(self) -> str:
-        """Name of the mesh; a mesh under several seeds is one object of the split."""
-        return self.drawn_as or self.name
-
-    def config_in(self, config: Config) -> Config:
-        """Return a dataset's configuration with the seed of this object's draws."""
-        return config if self.seed is None else config.model_copy(update={"seed": self.seed})
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
@@ -209,26 +194,18 @@ class Manifest:
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
-        hashes: dict[int | None, str] = {}
+        config_hash = self.config.simulation_hash()
         for entry in self.objects:
-            if entry.seed not in hashes:
-                hashes[entry.seed] = entry.config_in(self.config).simulation_hash()
             for unit in self.config.unit_ranges(entry.candidates):
                 if entry.tried is not None and unit.start >= entry.tried:
                     break
                 yield ShardHeader(
-                    config_hash=hashes[entry.seed],
+                    config_hash=config_hash,
                     mesh_sha256=entry.mesh_sha256,
                     object_name=entry.name,
                     start=unit.start,
                     stop=unit.stop,
-                    drawn_as=entry.drawn_as,
                 )
-
-    def config_of(self, name: str) -> Config:
-        """Return the configuration of the object of a name, see `ObjectEntry.config_in`."""
-        own = (entry.config_in(self.config) for entry in self.objects if entry.name == name)
-        return next(own, self.config)
 
     @property
     def units(self) -> int:
@@ -238,7 +215,7 @@ class Manifest:
     @property
     def groups(self) -> list[str]:
         """Group of each object, equal for objects of the same mesh, e.g. its morphs."""
-        return [entry.group or entry.mesh_name for entry in self.objects]
+        return [entry.group or entry.name for entry in self.objects]
 
     def signature(self) -> str:
         """Return a hash of everything that determines a row of the dataset, hexadecimal."""
@@ -431,11 +408,6 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "
             f"{differences(manifest.config, config)}; choose another --out"
-        )
-    if any(entry.seed is not None for entry in manifest.objects):
-        raise DataError(
-            f"{out}: must be of one seed to be built on, got a merged dataset of several; build on "
-            "those that it was merged of"
         )
     if (name := other_version(manifest.versions, installed)) is not None:
         raise DataError(

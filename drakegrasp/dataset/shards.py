@@ -46,7 +46,6 @@ class ShardHeader:
         mesh_sha256: Hash of the object's mesh file and of the object's attributes.
         object_name: Name of the object.
         start, stop: Range of the object's candidates.
-        drawn_as: Name of the object in the shard's file if it differs, see `ObjectEntry`.
     """
 
     config_hash: str
@@ -54,13 +53,11 @@ class ShardHeader:
     object_name: str
     start: int
     stop: int
-    drawn_as: str | None = None
 
     @property
     def stored(self) -> dict[str, str | int]:
         """The identity as the attributes of the shard's file."""
-        said = {key: value for key, value in asdict(self).items() if key != "drawn_as"}
-        return {**said, "object_name": self.drawn_as or self.object_name}
+        return asdict(self)
 
     @property
     def label(self) -> str:

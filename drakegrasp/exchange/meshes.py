@@ -52,7 +52,6 @@ def write_meshes(out: Path, folder: Path, progress: Report) -> int:
             "mass": entry.mass,
             **({} if entry.friction is None else {"friction": entry.friction}),
             **({} if entry.licence is None else {"licence": entry.licence}),
-            **({} if entry.mesh_name == entry.name else {"group": entry.mesh_name}),
             **({} if entry.group is None else {"group": entry.group}),
         }
         progress(done, len(manifest.objects))

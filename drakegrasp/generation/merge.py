@@ -1,8 +1,7 @@
-"""Merges datasets that were built separately, by objects, by seeds or by work units.
+"""Merges datasets that were built separately, by objects or by work units.
 
-Input: directories of datasets with the same configuration, except for the seed. Output: a directory
-with the files of their objects and shards, under names that distinguish seeds, and the assembled
-files. A mesh that was built with several seeds counts as one object in the split.
+Input: directories of datasets of one configuration. Output: a directory with the files of their
+objects and shards, and the assembled files.
 """
 
 from __future__ import annotations
@@ -13,12 +12,10 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import TypeAlias
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
 from drakegrasp.dataset.assembly.removal import own_filters
-from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -29,9 +26,7 @@ from drakegrasp.dataset.manifest import (
     with_postprocessing,
     write_manifest,
 )
-from drakegrasp.dataset.paths import ASSEMBLED_FILES, model_path, plan_path, shards_folder
-from drakegrasp.dataset.prepared_objects import with_drawn
-from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.paths import ASSEMBLED_FILES, object_files
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError
 from drakegrasp.hand.folder import carry_hand
@@ -40,13 +35,8 @@ from drakegrasp.runtime.progress import Report, silent
 
 #: What a build may end with. A merged dataset has none of it.
 _ENDS = ("samples", "samples_per_object")
-#: Keys in which datasets may differ. The merged dataset has the seed of the first dataset.
-_FREE = ("seed", "samples_patience", *_ENDS)
-
-
-#: An object of one of the datasets: the directory, the object's entry there, its work units, and
-#: its entry in the merged dataset.
-_Part: TypeAlias = tuple[Path, ObjectEntry, Sequence[ShardHeader], ObjectEntry]
+#: Keys in which datasets may differ.
+_FREE = ("samples_patience", *_ENDS)
 
 
 def merge(
@@ -58,8 +48,8 @@ def merge(
 ) -> Assembly:
     """Merge several datasets into a new one, which appears when it is complete.
 
-    The given datasets are not changed. An object that several datasets have with the same seed is
-    used once. Files are hard links if the file system allows them.
+    The given datasets are not changed. An object that several datasets have is used once. Files are
+    hard links if the file system allows them.
 
     Args:
         into: Directory of the merged dataset, new or empty.
@@ -81,14 +71,12 @@ def merge(
     manifests = {out: with_postprocessing(_read_complete(out), overrides) for out in outs}
     incomplete = [out for out in outs if _is_part(out)]
     _refuse_differences(manifests)
-    parts = _parts(manifests)
-    manifest = _merged_manifest(manifests, parts)
+    manifest = _merged_manifest(manifests)
     own_filters(manifest.config.filters)
 
     with disk_full_named(into), atomic_folder(into) as folder, build_lock(folder):
-        drawn = {entry.name: entry.candidates for entry in manifest.objects}
-        for part in parts:
-            _take_files(part, drawn, folder)
+        for out, part in manifests.items():
+            _take_files(out, part, folder)
         manifest = _with_hand(manifest, manifests.values(), folder)
         write_manifest(manifest, folder)
         _refuse_missing(manifest, folder, incomplete)
@@ -137,8 +125,8 @@ def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
         config = _with_hand_of(known.config, manifest.config)
         if differing := differences(known.config, config, _FREE):
             raise DataError(
-                f"{out}: must be of the configuration of {first} but for the seed, got one that "
-                f"differs in {differing}"
+                f"{out}: must be of the configuration of {first}, got one that differs in "
+                f"{differing}"
             )
         if (name := other_version(manifest.versions, known.versions)) is not None:
             raise DataError(
@@ -157,101 +145,46 @@ def _with_hand_of(known: Config, config: Config) -> Config:
     return config.with_hand(known.hand)
 
 
-def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
-    """Return the objects of all datasets, with their names and seeds in the merged dataset.
-
-    Raises:
-        DataError: If objects of the same name have different meshes, classes or groups.
-    """
-    seed = next(iter(manifests.values())).config.seed
-    entries = [
-        (out, entry, headers, entry.config_in(manifest.config).seed)
-        for out, manifest in manifests.items()
-        for entry, headers in zip(manifest.objects, headers_by_object(manifest), strict=True)
-    ]
-
-    # Collect the seeds of each mesh.
-    meshes, seeds = dict[str, tuple[Path, ObjectEntry]](), dict[str, set[int]]()
-    for out, entry, _, own in entries:
-        seeds.setdefault(entry.mesh_name, set()).add(own)
-        first, known = meshes.setdefault(entry.mesh_name, (out, entry))
-        for key in ("mesh_sha256", "class_name", "group"):
-            if getattr(known, key) != getattr(entry, key):
-                raise DataError(
-                    f"{out}: {entry.mesh_name} must have the {key} that it has in {first}, "
-                    f"{getattr(known, key)}, got {getattr(entry, key)}"
-                )
-
-    # An object keeps its split, so it must not have two.
-    homes = dict[str, tuple[Path, str]]()
-    for out, entry, _, _ in entries:
-        if entry.split is not None:
-            first, split = homes.setdefault(entry.group or entry.mesh_name, (out, entry.split))
-            if split != entry.split:
-                raise DataError(
-                    f"{out}: {entry.mesh_name} must be in one split of all datasets, got it in "
-                    f"{entry.split}, and in {split} of {first}; --set split.seed=1 draws all "
-                    "splits anew"
-                )
-
-    # A mesh keeps its name with the first seed, or if it has only one seed.
-    parts = list[_Part]()
-    for out, entry, headers, own in entries:
-        mesh, alone = entry.mesh_name, own == seed or len(seeds[entry.mesh_name]) == 1
-        merged = replace(
-            entry,
-            name=mesh if alone else f"{mesh}-seed-{own}",
-            seed=None if own == seed else own,
-            drawn_as=None if alone else mesh,
-        )
-        parts.append((out, entry, headers, merged))
-    return parts
-
-
-def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part]) -> Manifest:
+def _merged_manifest(manifests: Mapping[Path, Manifest]) -> Manifest:
     """Return the manifest of the merged dataset.
 
     Raises:
-        DataError: If two parts have the same name and differ.
+        DataError: If two datasets have an object of the same name and it differs.
     """
-    # Use each object once.
-    objects, names = dict[str, ObjectEntry](), dict[tuple[Path, str], str]()
-    for out, entry, _, merged in parts:
-        names[out, entry.name] = merged.name
-        known = objects.setdefault(merged.name, merged)
-        if with_drawn(replace(merged, tried=known.tried, split=known.split), known) != known:
-            theirs, ours = known.to_json(), with_drawn(merged, known).to_json()
-            keys = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
-            others = ", ".join(key for key in keys if key not in ("tried", "split"))
-            raise DataError(
-                f"{out}: {merged.name} must be equal in all datasets that have it under the same "
-                f"seed, got others in {others}"
-            )
-        objects[merged.name] = _longer(known, merged)
+    objects, homes = dict[str, ObjectEntry](), dict[str, tuple[Path, str]]()
+    for out, manifest in manifests.items():
+        for entry in manifest.objects:
+            # Files of an object, and so its entry, follow from its mesh and the configuration.
+            known = objects.setdefault(entry.name, entry)
+            theirs, ours = known.to_json(), entry.to_json()
+            others = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
+            if others not in ([], ["split"]):
+                raise DataError(
+                    f"{out}: {entry.name} must be equal in all datasets that have it, got others "
+                    f"in {', '.join(others)}"
+                )
 
-    first = next(iter(manifests.values()))
+            # An object keeps its split, so it must not have two.
+            if entry.split is not None:
+                objects[entry.name] = entry
+                first, split = homes.setdefault(entry.group or entry.name, (out, entry.split))
+                if split != entry.split:
+                    raise DataError(
+                        f"{out}: {entry.name} must be in one split of all datasets, got it in "
+                        f"{entry.split}, and in {split} of {first}; --set split.seed=1 draws all "
+                        "splits anew"
+                    )
+
+    of_first = next(iter(manifests.values()))
     refused = [mesh for manifest in manifests.values() for mesh in manifest.refused]
-    rejected = [
-        replace(key, object=names[out, key.object])
-        for out, manifest in manifests.items()
-        for key in manifest.rejected
-        if (out, key.object) in names
-    ]
+    rejected = [key for manifest in manifests.values() for key in manifest.rejected]
     return replace(
-        first,
-        config=first.config.model_copy(update=dict.fromkeys(_ENDS)),
+        of_first,
+        config=of_first.config.model_copy(update=dict.fromkeys(_ENDS)),
         objects=tuple(objects.values()),
         refused=tuple({mesh.name: mesh for mesh in refused if mesh.name not in objects}.values()),
         rejected=tuple(dict.fromkeys(rejected)),
     )
-
-
-def _longer(known: ObjectEntry, other: ObjectEntry) -> ObjectEntry:
-    """Return an object's entry with the palm poses of both entries that two datasets have of it."""
-    more = max(known, other, key=lambda entry: entry.candidates)
-    rows = max(entry.candidates if entry.tried is None else entry.tried for entry in (known, other))
-    tried = None if rows == more.candidates else rows
-    return replace(more, tried=tried, split=known.split or other.split)
 
 
 def _with_hand(manifest: Manifest, parts: Iterable[Manifest], folder: Path) -> Manifest:
@@ -263,36 +196,21 @@ def _with_hand(manifest: Manifest, parts: Iterable[Manifest], folder: Path) -> M
     return manifest
 
 
-def _take_files(part: _Part, drawn: Mapping[str, int], folder: Path) -> None:
-    """Link or copy the files of an object into a folder.
-
-    Args:
-        part: The object in one of the datasets.
-        drawn: Number of palm poses of each object in the merged dataset.
-        folder: Directory of the merged dataset.
+def _take_files(out: Path, manifest: Manifest, folder: Path) -> None:
+    """Link or copy the files of a dataset's objects into a folder.
 
     Raises:
-        DataError: If another part has put different files there.
+        DataError: If another dataset has put different files there.
     """
-    out, entry, headers, merged = part
-    pairs = [(model_path(out, entry.name), model_path(folder, merged.name))]
-    for header in headers:
-        # Another part of a build has the missing ones.
-        if header.path(out).exists():
-            pairs.append((header.path(out), shards_folder(folder, merged.name) / header.file_name))
-    for source, target in pairs:
+    files = [path for entry in manifest.objects for path in object_files(out, entry.name)]
+    # Another part of a build has the missing shards.
+    files += [path for each in manifest.headers() if (path := each.path(out)).exists()]
+    for source in files:
+        target = folder / source.relative_to(out)
         if not target.exists():
             _link(source, target)
         elif not filecmp.cmp(source, target, shallow=False):
-            raise DataError(
-                f"{source}: must be equal in all datasets with {entry.mesh_name} under the "
-                "same seed, got another"
-            )
-
-    # The longest plan has the palm poses of all others.
-    plan = plan_path(folder, merged.name)
-    if entry.candidates == drawn[merged.name] and not plan.exists():
-        _link(plan_path(out, entry.name), plan)
+            raise DataError(f"{source}: must be equal in all datasets that have it, got another")
 
 
 def _link(source: Path, target: Path) -> None:

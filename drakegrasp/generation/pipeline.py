@@ -349,7 +349,7 @@ class _Build:
             DrawTask(
                 out=self._out,
                 name=entry.name,
-                config=manifest.config_of(entry.name),
+                config=manifest.config,
                 count=min(2 * entry.candidates, most),
             )
             for entry in manifest.objects

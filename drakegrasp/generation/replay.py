@@ -122,7 +122,7 @@ def _stored_trial(
 ) -> tuple[dict[str, Any], PreparedObject, Attempt, Config]:
     """Return a row of trials.hdf5, with the object, attempt and configuration to run it again."""
     manifest, row = read_manifest(out), Trials(out).trial(trial_id)
-    config = manifest.config_of(row["object_name"])
+    config = manifest.config
     prepared = load_prepared(out, row["object_name"], config)
     candidate, standoff = (int(row[key]) for key in ("candidate", "standoff_index"))
     return row, prepared, find_attempt(prepared, candidate, standoff, config), config

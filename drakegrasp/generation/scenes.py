@@ -170,7 +170,7 @@ def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]
             out=out,
             name=entry.name,
             split=splits[i],
-            config=manifest.config_of(entry.name),
+            config=manifest.config,
             joints=manifest.joints,
             trials={**trials[ids].columns(GRASPS_FOLLOW_FROM)},
             samples=sample_split[ids] < len(SPLITS),

@@ -276,7 +276,7 @@ class _Request:
         for name in dict.fromkeys(objects):
             # An object that does not exist is known by its name alone.
             there = name if name in names else names[0]
-            own = manifest.config_of(there)
+            own = manifest.config
             prepared = load_prepared(out, there, own)
             model, poses, request = prepared.model, [*prepared.resting_poses], self
             if name != there:

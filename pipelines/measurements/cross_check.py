@@ -121,7 +121,7 @@ def cross_check(out: Path, count: int) -> dict[str, Any]:
     # Each object is cut into convex parts only once.
     with progress_bar("cross-check", "lifts") as progress:
         for name, same in groupby(sorted(lifts, key=_by_object), key=lambda x: x.object_name):
-            for row in _try_object(out, name, list(same), manifest.config_of(name)):
+            for row in _try_object(out, name, list(same), manifest.config):
                 rows.append(row)
                 progress(len(rows), len(lifts), held=sum(_holds(row) for row in rows))
     return {

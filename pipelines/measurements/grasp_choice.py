@@ -196,7 +196,7 @@ def prepared_objects(
     manifest = read_manifest(out)
 
     def at_rest(name: str) -> PlacedObject:
-        config = manifest.config_of(name)
+        config = manifest.config
         thing = load_prepared(out, name, config)
         changed = override_config(config, list(overrides))
         return PlacedObject(model=thing.model, X_TO=thing.X_TO, config=changed)

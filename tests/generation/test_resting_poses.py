@@ -140,7 +140,7 @@ def test_pictures_are_of_one_resting_pose(dataset: Path) -> None:
     own = (columns["object"] == 0) & (Trials(dataset)["removal"] == Removal.KEPT)
     counts = np.bincount(columns["resting"][own])
     assert 0 < counts.max() < counts.sum()
-    shown = read_approaches(dataset, name, read_manifest(dataset).config_of(name))
+    shown = read_approaches(dataset, name, read_manifest(dataset).config)
     assert len(shown.samples) == counts.max()
     assert shown.elsewhere == counts.sum() - counts.max()
     pose = (columns["object"] == 0) & (columns["resting"] == counts.argmax())

@@ -78,7 +78,7 @@ def broken_physics(out: Path) -> dict[str, list[int]]:
     # Resting poses are those of the manifest, and conditions those that the seed draws.
     rules |= {name: np.zeros(len(outcome), dtype=bool) for name in ("resting", "conditions")}
     for i, entry in enumerate(manifest.objects):
-        model, own = load_object(model_path(out, entry.name)), manifest.config_of(entry.name)
+        model, own = load_object(model_path(out, entry.name)), manifest.config
         for row in np.flatnonzero(trials["object"] == i).tolist():
             X_TO = entry.resting[int(trials["resting"][row])].X_TO
             rules["resting"][row] = np.abs(trials["X_TO"][row] - X_TO).max() > 1e-9

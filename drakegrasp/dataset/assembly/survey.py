@@ -217,7 +217,7 @@ def decide(manifest: Manifest, survey: Survey) -> Decisions:
     manifest = _with_homes(manifest, set(successes["object"][kept].tolist()))
     split = split_samples(
         successes["object"][kept],
-        [entry.mesh_name for entry in manifest.objects],
+        [entry.name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.groups,
         known_homes(manifest),
