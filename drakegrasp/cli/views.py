@@ -64,10 +64,8 @@ def figures(
 
         sheet          colour, depth and mask of samples of all objects in turn
         outcomes       how the attempts ended: samples, removed, failed
-        hold           samples: how well they hold, how many are distinct
         objects        samples of each object, and how many are distinct
         distributions  slip, turn, forces of the samples
-        approaches     from where the palms of the samples came
         views          views of scenes with a sample of each, if there are scenes
 
     Args:

@@ -20,7 +20,6 @@ from drakegrasp.pictures.style import INK, PREDICTED, png_bytes, shortened
 
 #: Colours of groups of grasps (Okabe and Ito), and of failures.
 GROUPS = {
-    "held": "#E69F00",
     "samples": "#E69F00",
     "distinct": "#0072B2",
     "precision": "#56B4E9",
@@ -42,38 +41,24 @@ LONGEST = 28
 NARROWEST = 7.6
 
 
-def draw_counts(
-    counts: Mapping[str, int],
-    what: str,
-    *,
-    colours: Sequence[str] | None = None,
-    title: str = "",
-    log: bool = True,
-) -> Figure:
-    """Return the counts of each kind as bars.
+def draw_counts(counts: Mapping[str, int], what: str, *, title: str = "") -> Figure:
+    """Return the counts of each kind as bars on a logarithmic scale.
 
     Args:
         counts: Counts by kind, in the order of the bars; the first kind is the desired one.
         what: What is counted, e.g. "attempts".
-        colours: Colours of the bars; if None, the first differs from the others.
         title: What the figure counts; none if empty.
-        log: Whether the scale is logarithmic.
     """
     names, numbers = list(counts), np.array(list(counts.values()))
     figure = Figure(figsize=(8.0, 0.9 + 0.3 * len(names)), layout="constrained")
     axes = figure.add_subplot()
     axes.set_title(title, fontsize="medium", color=INK)
-    colours = colours or [GROUPS["stable"] if i == 0 else FAILED for i in range(len(names))]
-    bars = axes.barh(
-        range(len(names)), np.maximum(numbers, 0.8 if log else 0), color=colours, height=0.72
-    )
+    colours = [GROUPS["stable"] if i == 0 else FAILED for i in range(len(names))]
+    bars = axes.barh(range(len(names)), np.maximum(numbers, 0.8), color=colours, height=0.72)
     axes.bar_label(bars, [f"{n:,}" for n in numbers], padding=3, color=INK, fontsize=9)
     _name_bars(axes, [name.replace("_", " ") for name in names])
-    if log:
-        axes.set_xscale("log")
-        axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
-    else:
-        axes.set_xlim(0.0, 1.1 * max(10, numbers.max(initial=0)))
+    axes.set_xscale("log")
+    axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
     axes.set_xlabel(what)
     return figure
 

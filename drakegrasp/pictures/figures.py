@@ -28,9 +28,7 @@ from drakegrasp.errors import DataError, counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.approaches import approaches_figure, coverage, read_approaches
 from drakegrasp.pictures.charts import (
-    GROUPS,
     draw_counts,
     draw_distributions,
     draw_objects,
@@ -42,8 +40,6 @@ from drakegrasp.runtime.progress import Report, silent
 
 #: Resolution of the pictures [pixels per inch].
 DPI = 150
-#: Number of objects in the figure of the approaches.
-OBJECTS = 8
 #: Name of the file of the numbers.
 NUMBERS_FILE = "figures.json"
 #: Columns from which `Samples` are computed.
@@ -121,10 +117,8 @@ def write_figures(
     drawings: dict[str, Callable[[], Drawn]] = {
         "sheet": lambda: _sheet(out),
         "outcomes": lambda: _outcomes(funnel),
-        "hold": lambda: _hold(samples, funnel),
         "objects": lambda: _objects(samples, funnel),
         "distributions": lambda: _distributions(samples, funnel),
-        "approaches": lambda: _approaches(out, funnel),
         "views": lambda: scene_views(out / SCENES_FILE),
     }
     known = {*drawings}
@@ -225,14 +219,6 @@ def _outcomes(funnel: Funnel) -> Drawn:
     return draw_counts(numbers, "attempts", title=title), numbers
 
 
-def _hold(samples: Samples, funnel: Funnel) -> Drawn:
-    numbers = {name: int(group.sum()) for name, group in samples.groups.items()}
-    numbers["distinct"] = int(funnel.distinct.sum())
-    colours = [GROUPS[name] for name in numbers]
-    figure = draw_counts(numbers, "samples", colours=colours, title=_told(funnel), log=False)
-    return figure, numbers
-
-
 def _objects(samples: Samples, funnel: Funnel) -> Drawn:
     size = len(funnel.names)
     counts = {"attempts": funnel.outcomes.sum(axis=1)}
@@ -261,24 +247,3 @@ def _distributions(samples: Samples, funnel: Funnel) -> Drawn:
     }
     quantities = list(samples.quantities.items())
     return draw_distributions(quantities, samples.groups, title=_told(funnel)), numbers
-
-
-def _approaches(out: Path, funnel: Funnel) -> Drawn:
-    # The objects with the most samples.
-    samples, names = funnel.samples, funnel.names
-    config_of = read_manifest(out).config_of
-    shown = [int(i) for i in np.argsort(-samples, kind="stable")[:OBJECTS] if samples[i]]
-    if not shown:
-        raise DataError(NO_SAMPLE)
-    items = [read_approaches(out, names[i], config_of(names[i])) for i in shown]
-    numbers = {
-        item.name: {
-            "attempts": item.attempts,
-            "samples": len(item.samples),
-            "distinct": item.distinct,
-            "samples_in_other_resting_poses": item.elsewhere,
-            "coverage_of_samples": round(coverage(item.samples), 4),
-        }
-        for item in items
-    }
-    return approaches_figure(items, left_out=int(np.count_nonzero(samples)) - len(shown)), numbers

@@ -18,15 +18,12 @@ from helpers.meshes import write_fixed
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.approaches import read_approaches
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
@@ -133,18 +130,6 @@ def test_lifts_are_tried_elsewhere_as_they_lay(
     ids = [lift["trial_id"] for lift in lifts]
     assert len(np.unique(columns["resting"][ids])) > 1
     np.testing.assert_array_equal(stood, [unpack_pose(columns["X_TO"][i]) for i in ids])
-
-
-def test_pictures_are_of_one_resting_pose(dataset: Path) -> None:
-    columns, name = trials(dataset), "8_wineglass_flute"
-    own = (columns["object"] == 0) & (Trials(dataset)["removal"] == Removal.KEPT)
-    counts = np.bincount(columns["resting"][own])
-    assert 0 < counts.max() < counts.sum()
-    shown = read_approaches(dataset, name, read_manifest(dataset).config)
-    assert len(shown.samples) == counts.max()
-    assert shown.elsewhere == counts.sum() - counts.max()
-    pose = (columns["object"] == 0) & (columns["resting"] == counts.argmax())
-    assert shown.attempts == np.count_nonzero(pose)
 
 
 @pytest.mark.nightly

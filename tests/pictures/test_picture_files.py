@@ -15,17 +15,12 @@ from helpers import datasets
 from helpers.datasets import OTO, SLIP, TRIALS, edit_file, make_dataset
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
-from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.approaches import read_approaches
 from drakegrasp.pictures.figures import NUMBERS_FILE, read_samples, write_figures
 
-ALL = {
-    *("sheet", "outcomes", "hold", "objects", "distributions", "approaches"),
-}
+ALL = {"sheet", "outcomes", "objects", "distributions"}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -57,7 +52,6 @@ def test_the_same_dataset_gives_the_same_bytes(
             assert b"<dc:date>" not in content
     numbers = json.loads(files[NUMBERS_FILE])
     assert numbers["outcomes"]["samples"] == 9
-    assert numbers["hold"]["samples"] == numbers["hold"]["stable"] == 9
 
     # The style of somebody's papers changes nothing.
     with mpl.rc_context({"font.size": 25, "axes.grid": True, "savefig.dpi": 30}):
@@ -72,11 +66,10 @@ def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None
     lose_all(out)
     folder = tmp_path / "figures"
     folder.mkdir()
-    for name in ("approaches.png", "sheet.svg", "mine.png"):
+    for name in ("distributions.png", "sheet.svg", "mine.png"):
         (folder / name).touch()
     written = write_figures(out, folder)
-    assert set(written.names) == {"outcomes", "hold", "objects"}
-    assert written.left_out["approaches"] == "no attempt became a sample"
+    assert set(written.names) == {"outcomes", "objects"}
     assert written.left_out["distributions"] == "no attempt became a sample"
     assert OTO in written.left_out["sheet"]
     # A picture of what was there before is removed, and nothing else.
@@ -85,7 +78,7 @@ def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None
         "mine.png",
     }
     assert not (folder / "sheet.svg").exists()
-    assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["samples"] == 0
+    assert json.loads((folder / NUMBERS_FILE).read_text())["outcomes"]["samples"] == 0
 
 
 def test_pictures_of_samples_count_the_same_rows(sound: Path, tmp_path: Path) -> None:
@@ -94,12 +87,11 @@ def test_pictures_of_samples_count_the_same_rows(sound: Path, tmp_path: Path) ->
     assemble(out, rejected=[0, 12])
     assert "sheet" in write_figures(out, tmp_path / "figures").names
     numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
-    assert numbers["hold"]["samples"] == numbers["outcomes"]["samples"] == 7
+    assert numbers["outcomes"]["samples"] == 7
     assert numbers["outcomes"]["removed: rejected"] == 2
     assert sum(numbers["outcomes"].values()) == 36
-    for kind in ("objects", "approaches"):
-        assert [each["samples"] for each in numbers[kind].values()].count(2) == 2, kind
-        assert sum(each["samples"] for each in numbers[kind].values()) == 7, kind
+    samples = [each["samples"] for each in numbers["objects"].values()]
+    assert (samples.count(2), sum(samples)) == (2, 7)
     assert sorted(numbers["sheet"]["trial_ids"]) == [3, 11, 15, 23, 24, 27, 35]
 
 
@@ -137,22 +129,3 @@ def test_a_file_without_samples_has_none(sound: Path, tmp_path: Path) -> None:
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials"):
         read_samples(tmp_path)
-
-
-def test_approaches_are_of_one_object(sound: Path, tmp_path: Path) -> None:
-    config = read_manifest(sound).config
-    found = read_approaches(sound, "2_box_b", config)
-    assert found.attempts == 12
-    assert found.holds.tolist() == [2, 2, 2]  # stable
-    assert found.elsewhere == 0
-    # All palms are tilted by 0.25 rad; the one attempt whose ray misses, row 7, approached nothing.
-    np.testing.assert_allclose(found.samples[:, 2], np.cos(0.25), atol=1e-9)
-    with h5py.File(sound / TRIALS, "r") as file:
-        rows = [1, 2, 4, 5, 6, 8, 9, 10]
-        X_TO, X_OG = (unpack_pose(file[f"trials/{name}"][12:24][rows]) for name in ("X_TO", "X_OG"))
-    np.testing.assert_allclose(found.directions, -(X_TO @ X_OG)[:, :3, 2], atol=1e-9)
-    with h5py.File(sound / TRIALS, "r") as file:
-        standoffs = np.array(config.candidates.standoffs)
-        rows = file["trials/standoff_index"][12:24][[0, 3, 11]]
-    lengths = np.linalg.norm(found.rays[:, 1] - found.rays[:, 0], axis=1)
-    np.testing.assert_allclose(lengths, standoffs[rows])
