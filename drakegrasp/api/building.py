@@ -22,10 +22,9 @@ from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.errors import DataError, GraspError, counted
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.foreign_files import refuse_address
-from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.directory import BuildDirectory, open_directory
 from drakegrasp.generation.pipeline import BuildReport, build
-from drakegrasp.generation.request import BUILTIN, Part, read_part, refuse_unknown
+from drakegrasp.generation.request import BUILTIN, build_config, refuse_unknown
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -48,7 +47,6 @@ def build_dataset(
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
     postures: str | Path | Attempts | None = None,
-    part: str | None = None,
     read_as: Mapping[str, str] | None = None,
     client: Client | None = None,
     cluster: AbstractContextManager[Client] | None = None,
@@ -70,8 +68,6 @@ def build_dataset(
         only: Names of the objects to build; all if empty.
         postures: A file or a table of postures that replace drawn palm poses. Only the objects that
             it names are built; invalid rows are reported and left out.
-        part: A part of the work units, e.g. "3/16"; `merge` joins the directories of all parts.
-            It cannot be combined with a requested number of samples.
         read_as: How to read all postures of a file: `frame` and `link` override what the file
             states; `preshape` applies to rows that name none.
         client: A Dask client whose workers do the work, e.g. from `connect`.
@@ -85,7 +81,7 @@ def build_dataset(
         MeshError: If there is no mesh.
         GraspError: If no row of the postures is for an available object.
         ConfigError: If both workers and a scheduler are given, the address is empty, the scheduler
-            wants no certificate although `tls` is set, or the part is invalid.
+            wants no certificate although `tls` is set.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or the disk is full;
@@ -94,7 +90,7 @@ def build_dataset(
     refuse_address(out)
     running = joined(client, workers) if cluster is None else cluster
     config = config or load_config(BUILD_PRESET)
-    work = _asked(objects, config, units, manifest, only, postures, part, read_as)
+    work = _asked(objects, config, units, manifest, only, postures, read_as)
     with (
         open_directory(Path(out).absolute(), work.config, work.names) as directory,
         _workers_of(running, directory, work.sources or (), show=show) as (execute, pool),
@@ -110,7 +106,6 @@ def build_dataset(
             sources,
             execute,
             postures=work.postures,
-            part=work.part,
             pool=pool,
             show=show,
         )
@@ -154,14 +149,12 @@ class _Work(NamedTuple):
         sources: The meshes of the objects; None for the built-in objects.
         names: Names of the objects.
         postures: Postures of these objects; None: palm poses are drawn.
-        part: Part of the work units to run; all if None.
     """
 
     config: Config
     sources: list[MeshSource] | None
     names: list[str]
     postures: Attempts | None
-    part: Part | None
 
 
 def _asked(
@@ -171,7 +164,6 @@ def _asked(
     manifest: str | Path | None,
     only: Sequence[str],
     postures: str | Path | Attempts | None,
-    part: str | None,
     read_as: Mapping[str, str] | None,
 ) -> _Work:
     """Return what a build with these arguments of `build_dataset` does; nothing is written.
@@ -182,8 +174,7 @@ def _asked(
     if isinstance(postures, str | Path):
         hand = load_hand(config.hand_source)
         postures = read_attempts(Path(postures), hand, read_as=read_as)
-    job = None if part is None else read_part(part)
-    config = build_config(config, postures, job)
+    config = build_config(config, postures)
 
     # The objects, by their names.
     if str(objects) == BUILTIN:
@@ -203,7 +194,7 @@ def _asked(
             raise GraspError(f"postures must be of an object that is built{why}")
     if sources is not None:
         sources = [source for source in sources if source.name in chosen]
-    return _Work(config=config, sources=sources, names=chosen, postures=postures, part=job)
+    return _Work(config=config, sources=sources, names=chosen, postures=postures)
 
 
 def known_work(
@@ -214,14 +205,13 @@ def known_work(
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
     postures: str | Path | Attempts | None = None,
-    part: str | None = None,
     read_as: Mapping[str, str] | None = None,
 ) -> list[str]:
     """Return lines on the work of a build as far as it is known before; nothing is written.
 
     Arguments and errors are those of `build_dataset`.
     """
-    work = _asked(objects, config, units, manifest, only, postures, part, read_as)
+    work = _asked(objects, config, units, manifest, only, postures, read_as)
     config, count = work.config, len(work.names)
 
     # A posture is tried in each resting pose and with each preshape that it allows.
@@ -233,11 +223,7 @@ def known_work(
     poses = config.candidates.max
     number = count * sum(1 for _ in config.unit_ranges(poses))
     palms = counted(count * poses, "palm pose")
-    lines = [f"{counted(count, 'object')}: at most {palms} in {counted(number, 'work unit')}"]
-    if work.part is not None:
-        own = sum(map(work.part.has, range(number)))
-        lines.append(f"part {part}: at most {own:,} of these work units")
-    return lines
+    return [f"{counted(count, 'object')}: at most {palms} in {counted(number, 'work unit')}"]
 
 
 def _target_lines(config: Config, objects: int) -> list[str]:

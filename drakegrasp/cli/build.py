@@ -12,7 +12,6 @@ from cyclopts import Parameter
 import drakegrasp as dg
 from drakegrasp.cli.arguments import AnyPath, Count, Folder, NewFile, Settings, Tls, What, Workers
 from drakegrasp.cli.console import UsageError, same_command, say
-from drakegrasp.cli.help import MORE
 from drakegrasp.errors import counted
 
 if TYPE_CHECKING:
@@ -24,7 +23,6 @@ def build(
     *,
     what: What,
     dry_run: bool = False,
-    part: Annotated[str | None, Parameter(group=MORE, metavar="I/N")] = None,
     workers: Workers = Workers(),
 ) -> None:
     """Build a dataset from a directory of meshes.
@@ -34,16 +32,14 @@ def build(
 
     Args:
         dry_run: Only print the amount of work that is known before the build.
-        part: Only run every Nth work unit, starting with the Ith; `merge` joins the datasets of all
-            N parts.
     """
     asked, on = what.asked(), workers.asked()
     if dry_run:
         from drakegrasp.api.building import known_work
 
-        say("\n".join(known_work(**asked, part=part)))
+        say("\n".join(known_work(**asked)))
         return
-    print_report(dg.build_dataset(**asked, **on, out=what.out, part=part, show=not what.quiet))
+    print_report(dg.build_dataset(**asked, **on, out=what.out, show=not what.quiet))
 
 
 def submit(
@@ -182,7 +178,6 @@ def print_report(report: BuildReport) -> None:
     for entry in report.refused:
         say(f"refused: {entry.name}: {entry.reason}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
-        if report.assembly is not None:
-            say(str(report.out / name))
+        say(str(report.out / name))
     if report.unexplained:
         sys.exit(1)

@@ -91,9 +91,8 @@ def merge(
 ) -> None:
     """Merge several datasets that were built separately.
 
-    The datasets may differ only in their objects, their seeds, their parts (`build --part`), and
-    the settings that --set changes for all of them. INTO must be new or empty, and appears when it
-    is complete; OUTS do not change.
+    The datasets may differ only in their objects, and in the settings that --set changes for all of
+    them. INTO must be new or empty, and appears when it is complete; OUTS do not change.
 
     Args:
         into: Directory of the new dataset.

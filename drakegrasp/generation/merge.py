@@ -1,4 +1,4 @@
-"""Merges datasets that were built separately, by objects or by work units.
+"""Merges datasets of different objects that were built separately.
 
 Input: directories of datasets of one configuration. Output: a directory with the files of their
 objects and shards, and the assembled files.
@@ -26,7 +26,7 @@ from drakegrasp.dataset.manifest import (
     with_postprocessing,
     write_manifest,
 )
-from drakegrasp.dataset.paths import ASSEMBLED_FILES, object_files
+from drakegrasp.dataset.paths import object_files
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError
 from drakegrasp.hand.folder import carry_hand
@@ -69,7 +69,6 @@ def merge(
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise DataError(f"{into}: must be a new or empty directory, got one that is in use")
     manifests = {out: with_postprocessing(_read_complete(out), overrides) for out in outs}
-    incomplete = [out for out in outs if _is_part(out)]
     _refuse_differences(manifests)
     manifest = _merged_manifest(manifests)
     own_filters(manifest.config.filters)
@@ -79,39 +78,18 @@ def merge(
             _take_files(out, part, folder)
         manifest = _with_hand(manifest, manifests.values(), folder)
         write_manifest(manifest, folder)
-        _refuse_missing(manifest, folder, incomplete)
         return assemble_locked(folder, manifest, progress=progress)
 
 
 def _read_complete(out: Path) -> Manifest:
-    """Return the manifest of a complete dataset, or of a part of a dataset."""
+    """Return the manifest of a complete dataset."""
     manifest = read_manifest(out)
-    if not _is_part(out) and not is_assembled(out, verify_shards=True):
+    if not is_assembled(out, verify_shards=True):
         raise DataError(
             f"{out}: must be a complete dataset, got one whose files are not of all its shards; "
             "complete it with `drakegrasp build` or `assemble`"
         )
     return manifest
-
-
-def _is_part(out: Path) -> bool:
-    """Return whether a directory has no assembled files, so holds a part of a dataset."""
-    return not any((out / name).exists() for name in ASSEMBLED_FILES)
-
-
-def _refuse_missing(manifest: Manifest, folder: Path, parts: Sequence[Path]) -> None:
-    """Check that parts together have all work units.
-
-    Raises:
-        DataError: If a work unit is missing.
-    """
-    missing = [header for header in manifest.headers() if not header.path(folder).exists()]
-    if parts and missing:
-        first = missing[0]
-        raise DataError(
-            f"{parts[0]}: must be a complete dataset, or given with all other parts of its build, "
-            f"got none that has {first.object_name}, palm poses {first.start} to {first.stop - 1}"
-        )
 
 
 def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
@@ -203,8 +181,7 @@ def _take_files(out: Path, manifest: Manifest, folder: Path) -> None:
         DataError: If another dataset has put different files there.
     """
     files = [path for entry in manifest.objects for path in object_files(out, entry.name)]
-    # Another part of a build has the missing shards.
-    files += [path for each in manifest.headers() if (path := each.path(out)).exists()]
+    files += [header.path(out) for header in manifest.headers()]
     for source in files:
         target = folder / source.relative_to(out)
         if not target.exists():

@@ -50,7 +50,6 @@ from drakegrasp.generation.prepare import (
     first_palms,
     prepare_one,
 )
-from drakegrasp.generation.request import Part
 from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import (
     UnitSummary,
@@ -82,7 +81,7 @@ class BuildReport:
         unexplained: A line for each object with so many crashes or timeouts that the machine must
             be the cause; the dataset is complete, but the labels of such an object are wrong.
         assembled: Whether this build wrote the assembled files; otherwise they were up to date.
-        assembly: Content of the assembled files; None after a part of a build that is not the last.
+        assembly: Content of the assembled files.
     """
 
     out: Path
@@ -94,7 +93,7 @@ class BuildReport:
     notices: tuple[str, ...]
     unexplained: tuple[str, ...]
     assembled: bool
-    assembly: Assembly | None
+    assembly: Assembly
 
 
 def build(
@@ -103,7 +102,6 @@ def build(
     execute: Executor,
     *,
     postures: Attempts | None = None,
-    part: Part | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -118,8 +116,6 @@ def build(
         execute: Runs the tasks.
         postures: Postures to try instead of palm poses of samplers. The configuration states their
             digest, see `build_config`. Invalid rows are reported and not tried.
-        part: Part of the work units to run; all if None. The assembled files are written when all
-            units are complete.
         pool: The executor's processes, if they are restarted when they die. A crash or a hang then
             ends only one attempt. Without a pool, crashes propagate to the caller.
         show: Whether to show progress on standard error.
@@ -131,7 +127,7 @@ def build(
         DiskFullError: If the disk is full; the same call continues when there is space.
         MachineError: If the workers cannot do the work.
     """
-    return _Build(directory, execute, postures, part, pool, show=show).run(sources)
+    return _Build(directory, execute, postures, pool, show=show).run(sources)
 
 
 class _Build:
@@ -142,7 +138,6 @@ class _Build:
         directory: BuildDirectory,
         execute: Executor,
         postures: Attempts | None,
-        part: Part | None,
         pool: WorkerPool | None,
         *,
         show: bool,
@@ -151,7 +146,7 @@ class _Build:
         self._manifest, self._notices = directory.manifest, list(directory.notices)
         self._config = directory.manifest.config
         self._execute, self._pool, self._show = execute, pool, show
-        self._postures, self._part = postures, part
+        self._postures = postures
 
         # With a target: the palm poses that the dataset had of each object, the grasps that are no
         # samples by inspection, the successes of each completed unit, and the last survey of them.
@@ -176,18 +171,12 @@ class _Build:
         # Simulate the missing work units; remove the temporary files of killed workers.
         what = "samples" if self._config.has_target else "palms"
         with self._progress("simulate", what) as report:
-            counts, left = self._simulate(report)
+            counts = self._simulate(report)
         write_manifest(self._manifest, self._out)
         if self._pool is not None:
             sweep_temporary(self._out)
 
-        # The assembled files need all work units, so only the part that completes them writes them.
-        assembled = False if left else self._assemble()
-        if left:
-            units = counted(left, "work unit")
-            self._notices.append(f"{units} of other parts left; `drakegrasp merge` joins all parts")
-
-        # Report.
+        assembled = self._assemble()
         if counts.damaged:
             shards = f"{counted(len(counts.damaged), 'shard')} ({listed(counts.damaged)})"
             self._notices.append(f"{shards}: damaged, and simulated again")
@@ -204,7 +193,7 @@ class _Build:
             notices=tuple(self._notices),
             unexplained=unexplained,
             assembled=assembled,
-            assembly=None if left else summarise(self._out),
+            assembly=summarise(self._out),
         )
 
     def _say(self, text: str) -> None:
@@ -226,10 +215,10 @@ class _Build:
         before: dict[str, ObjectEntry | RefusedMesh] = {e.name: e for e in manifest.objects}
         before |= {entry.name: entry for entry in manifest.refused}
 
-        # Reuse the manifest's entries of unchanged meshes.
+        # Reuse the files of unchanged meshes.
         entries: dict[str, ObjectEntry | RefusedMesh] = {}
         for source in sources:
-            entry = _unchanged(source, before.get(source.name), self._out, self._config)
+            entry = _known_entry(source, before.get(source.name), self._out, self._config)
             if entry is not None:
                 entries[source.name] = entry
         reused = len(entries)
@@ -289,12 +278,8 @@ class _Build:
 
     # Work units
 
-    def _simulate(self, report: Report) -> tuple[Counts, int]:
-        """Run the missing work units, and set how many palm poses the dataset takes.
-
-        Returns:
-            The counts of all units, and the number of units that are left to other parts.
-        """
+    def _simulate(self, report: Report) -> Counts:
+        """Run the missing work units, and set how many palm poses the dataset takes."""
         manifest, config = self._manifest, self._config
         target = Target(config, self._floors) if config.has_target else None
         counts = Counts(manifest, target, self._pool, report)
@@ -314,15 +299,10 @@ class _Build:
 
         if target is not None:
             self._meet(target, counts)
-            return counts, 0
-        part = self._part
-        due = [
-            (header, part is None or part.has(i))
-            for i, header in enumerate(manifest.headers())
-            if header not in done
-        ]
-        self._run_units((header for header, mine in due if mine), counts, target)
-        return counts, sum(not mine for _, mine in due)
+        else:
+            due = (header for header in manifest.headers() if header not in done)
+            self._run_units(due, counts, target)
+        return counts
 
     def _meet(self, target: Target, counts: Counts) -> None:
         """Run units until a target is met or cannot be met.
@@ -447,21 +427,20 @@ def _refused(postures: Attempts, manifest: Manifest) -> str:
     return postures.refused
 
 
-def _unchanged(
-    source: MeshSource, entry: ObjectEntry | RefusedMesh | None, out: Path, config: Config
+def _known_entry(
+    source: MeshSource, before: ObjectEntry | RefusedMesh | None, out: Path, config: Config
 ) -> ObjectEntry | RefusedMesh | None:
-    """Return the manifest's entry of a mesh as it is now; None if the mesh must be prepared."""
-    if isinstance(entry, RefusedMesh):
-        same = not entry.again and source_sha256(source) == entry.mesh_sha256
-        return entry if same else None
-    if entry is None or entry.class_name != source.class_name:
-        return None
-    if source_sha256(source) != entry.mesh_sha256:
-        return None
+    """Return the entry of a mesh as it is now; None if the mesh must be prepared.
+
+    The files of an object decide, since a build that died may not have written its entry.
+    """
+    if isinstance(before, RefusedMesh):
+        same = not before.again and source_sha256(source) == before.mesh_sha256
+        return before if same else None
     try:
         prepared = load_prepared(out, source.name, config)
     except DrakegraspError:
         return None
-    # A build that was stopped may have drawn more palm poses than the manifest says.
-    enough = prepared.asked >= first_palms(config)
-    return with_drawn(entry, prepared.entry()) if enough else None
+    model = prepared.model
+    same = (model.class_name, model.mesh_sha256) == (source.class_name, source_sha256(source))
+    return prepared.entry() if same and prepared.asked >= first_palms(config) else None

@@ -1,45 +1,71 @@
-"""What a build is asked for: names of objects, and the part of its work units of a job."""
+"""What a build is asked for: its configuration, and the names of objects.
+
+Input: the configuration that a caller states. Output: one that ends and that names the postures, or
+an error before anything is written.
+"""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from drakegrasp.config import MOST_PALMS, Config
+from drakegrasp.dataset.assembly.removal import own_filters
 from drakegrasp.errors import ConfigError, MeshError, listed
+from drakegrasp.hand.description import load_hand
+from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.candidates import refuse_samplers
+from drakegrasp.simulation.drive import drive_of
 
 #: Name that requests the built-in objects instead of a directory of meshes.
 BUILTIN = "builtin"
+#: Number of samples of each object that a build makes if nothing else ends it.
+SAMPLES_PER_OBJECT = 20
 
 
-@dataclass(frozen=True)
-class Part:
-    """A part of the work units of a build, for jobs that do not communicate.
+def build_config(config: Config, postures: Attempts | None = None) -> Config:
+    """Return the configuration of a build, which ends and names its postures.
 
-    Attributes:
-        number: Number of the part, from 1.
-        of: Number of parts.
-    """
+    Without a target and a number of palm poses, samplers without an end would go on for hours, so
+    each object then ends with `SAMPLES_PER_OBJECT` samples.
 
-    number: int
-    of: int
-
-    def has(self, unit: int) -> bool:
-        """Return whether a work unit, counted from 0, belongs to the part."""
-        return unit % self.of == self.number - 1
-
-
-def read_part(text: str) -> Part:
-    """Return the part that a text such as 3/16 names.
+    Args:
+        config: Configuration that the caller states.
+        postures: Postures to try instead of palm poses of samplers.
 
     Raises:
-        ConfigError: If the text does not name a part.
+        ConfigError: If the configuration names other postures, or a class that cannot be used.
+        HandError: If the hand cannot be used, or a sampler cannot be used with it.
     """
-    match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text.strip())
-    part = Part(*map(int, match.groups())) if match else Part(0, 0)
-    if not 1 <= part.number <= part.of:
-        raise ConfigError(f"part must be I/N, with I from 1 to N, got {text[:40]!r}")
-    return part
+    config = _with_postures(config, postures)
+    rules = config.candidates
+    endless = "closing" in rules.method and rules.postures is None
+    if endless and rules.max == MOST_PALMS and not config.has_target:
+        config = config.model_copy(update={"samples_per_object": SAMPLES_PER_OBJECT})
+
+    # The hand, and classes that are not of this package.
+    drive_of(load_hand(config.hand_source), config.lift)
+    if rules.postures is None:
+        refuse_samplers(config)
+    own_filters(config.filters)
+    return config
+
+
+def _with_postures(config: Config, postures: Attempts | None) -> Config:
+    """Return a configuration that names the given postures.
+
+    Raises:
+        ConfigError: If it names other postures.
+    """
+    digest, named = None if postures is None else postures.digest(), config.candidates.postures
+    if named not in (None, digest):
+        must = "left out; the postures that are given decide" if digest else "given with postures"
+        raise ConfigError(f"candidates.postures must be {must}, got {named!r}")
+    if digest is None:
+        return config
+    # A posture has no stand-off, so there is one attempt per posture.
+    rules = config.candidates
+    changed = {"postures": digest, "standoffs": rules.standoffs[:1]}
+    return config.model_copy(update={"candidates": rules.model_copy(update=changed)})
 
 
 def refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:

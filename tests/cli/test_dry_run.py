@@ -30,13 +30,6 @@ def dry_run(out: Path, *words: str | Path) -> Result:
             ("--only", "1_mug_1", "--only", "1_mug_1", "--candidates", "101"),
             ["1 object: at most 101 palm poses in 13 work units"],
         ),
-        (
-            ("--only", "1_mug_1", "--candidates", "101", "--part", "2/2"),
-            [
-                "1 object: at most 101 palm poses in 13 work units",
-                "part 2/2: at most 6 of these work units",
-            ],
-        ),
     ],
 )
 def test_dry_run_tells_the_most_work_and_writes_nothing(
@@ -87,8 +80,6 @@ def test_dry_run_of_postures_counts_those_that_can_be_tried(tmp_path: Path) -> N
     ("words", "must"),
     [
         (("--only", "1_jug_1"), "only must be names of objects"),
-        (("--part", "3/2"), "part must be I/N"),
-        (("--part", "1/2", "--samples", "3"), "part must be of a build with a number"),
         (("--set", "candidates.postures=0123456789abcdef"), "candidates.postures must be"),
     ],
 )

@@ -35,8 +35,8 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import make_pose, rotation_about
-from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.pipeline import BuildReport
+from drakegrasp.generation.request import build_config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes

@@ -24,9 +24,9 @@ from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import make_pose, unpack_pose
-from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.generation.replay import replay_trial
+from drakegrasp.generation.request import build_config
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions

@@ -15,10 +15,9 @@ from helpers import faults
 
 from drakegrasp.config import Config
 from drakegrasp.generation import pipeline
-from drakegrasp.generation.build_config import build_config
 from drakegrasp.generation.directory import open_directory
 from drakegrasp.generation.pipeline import BuildReport
-from drakegrasp.generation.request import Part
+from drakegrasp.generation.request import build_config
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.runtime.executor import Executor
 from drakegrasp.simulation.attempts import Attempts
@@ -52,13 +51,12 @@ def build(
     execute: Executor,
     *,
     postures: Attempts | None = None,
-    part: Part | None = None,
     **options: Any,
 ) -> BuildReport:
     """Build the dataset of some meshes in a directory."""
-    config = build_config(config, postures, part)
+    config = build_config(config, postures)
     with open_directory(out, config, [source.name for source in sources]) as directory:
-        return pipeline.build(directory, sources, execute, postures=postures, part=part, **options)
+        return pipeline.build(directory, sources, execute, postures=postures, **options)
 
 
 def start_build(
