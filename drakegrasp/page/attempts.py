@@ -29,10 +29,9 @@ from drakegrasp.page.looks import (
 )
 from drakegrasp.simulation.attempt import Source
 
-#: Features of an attempt for filtering and sorting, with their display.
+#: Features of an attempt for sorting, with their display.
 QUANTITIES = {
     "suspicion": Shown("suspicion", digits=2),
-    "force": Shown("largest force", "N"),
     **{part.name: part.shown for part in PARTS},
 }
 #: Texts of two choices of the split: all samples, and all attempts that are not samples.
@@ -67,7 +66,6 @@ class Attempts(Gallery):
         "decision": "decision",
     }
     QUANTITIES = QUANTITIES
-    RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle")
     SORTS: ClassVar = {
         **{name: quantity.title for name, quantity in QUANTITIES.items()},
         "row": "row of the dataset",
@@ -205,7 +203,6 @@ class Attempts(Gallery):
             "score": _text(snapshot, "suspicion", i),
             "parts": _parts(row),
             "facts": _facts(snapshot, i, row),
-            "fingers": _fingers(row),
             "scene": attempt_scene(snapshot, i, row, hand),
         }
 
@@ -280,23 +277,3 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
         ),
         ("other links after closing", str(int(row["closed_other_links"])) if closed else "–"),
     ]
-
-
-def _fingers(row: dict[str, Any]) -> list[list[str]]:
-    """Return a row per finger: forces, depths, areas, fit to the mesh; a dash if there is none."""
-
-    def text(value: Any, factor: float, digits: int) -> str:
-        return f"{factor * value:.{digits}f}" if np.isfinite(value) else "–"
-
-    fingers = []
-    for k in range(len(row["closed_touching"])):
-        cells = []
-        for when in ("closed", "lifted"):
-            force = np.linalg.norm(row[f"{when}_f_Q_O"][k])
-            numbers = force, row[f"{when}_penetration"][k], row[f"{when}_area"][k]
-            touching = bool(row[f"{when}_touching"][k])
-            for value, factor, digits in zip(numbers, (1.0, 1e3, 1e6), (1, 2, 0), strict=True):
-                cells.append(text(float(value) if touching else np.nan, factor, digits))
-        angle, distance = np.rad2deg(float(row["normal_angle"][k])), row["surface_distance"][k]
-        fingers.append([*cells, text(angle, 1.0, 1), text(float(distance), 1e3, 2)])
-    return fingers

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, model_path
@@ -28,13 +27,11 @@ from drakegrasp.hand.folder import carried_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.table import AnyArray, Table, join
 
-#: Quantities for filtering and sorting, besides the parts of the suspicion.
-EXTRA = ("suspicion", "force")
+#: Quantities for sorting, besides the parts of the suspicion.
+EXTRA = ("suspicion",)
 FEATURES = (*EXTRA, *(part.name for part in PARTS))
 #: Columns that identify an attempt.
 IDENTITY = ("object", "candidate", "standoff_index")
-#: Further column from which features are computed.
-_READ = "closed_f_Q_O"
 #: Columns that the table of attempts copies, and their types.
 _KEPT: dict[str, type[np.generic]] = {
     "object": np.int32,
@@ -58,7 +55,7 @@ def read_attempts(trials: Trials) -> Table:
     Raises:
         DataError: If a file cannot be read.
     """
-    names = dict.fromkeys((*_KEPT, *COLUMNS, _READ))
+    names = dict.fromkeys((*_KEPT, *COLUMNS))
     return join([_columns_of(block) for block in trials.blocks(list(names))])
 
 
@@ -68,11 +65,7 @@ def _columns_of(columns: Mapping[str, AnyArray]) -> Table:
     closed = np.isfinite(columns["time_close"])
     few = {name: values[closed] for name, values in columns.items()}
     doubts = suspicion(few)
-
-    # The largest force of a fingertip, after the lift if there was one.
-    lifted = np.isfinite(few["time_lift"])[:, None, None]
-    forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
-    found = {"suspicion": doubts.score, "force": norm(forces).max(axis=1, initial=-np.inf)}
+    found = {"suspicion": doubts.score}
 
     # A value that a contact without a normal lacks counts as the largest part, so it is infinite.
     found |= {

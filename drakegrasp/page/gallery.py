@@ -27,8 +27,6 @@ from drakegrasp.pictures.style import FINGER_COLOURS, PREDICTED, REACHED, TRUE
 from drakegrasp.table import AnyArray, Table
 
 Places: TypeAlias = npt.NDArray[np.int32]
-#: Smallest and largest value; None for no limit.
-Limits: TypeAlias = tuple[float | None, float | None]
 #: Number of cards on a page of a gallery.
 PAGE = 24
 #: Codes of the numbers in columns, by the names of the columns.
@@ -69,12 +67,10 @@ class Query:
 
     Attributes:
         values: Values by the names of parameters; an empty text means any value.
-        ranges: Smallest and largest value of quantities, in the units that are shown.
         default: Default values, which an address need not contain.
     """
 
     values: Mapping[str, str]
-    ranges: Mapping[str, Limits]
     default: Mapping[str, str]
 
     def __getitem__(self, name: str) -> str:
@@ -93,13 +89,7 @@ class Query:
         Args:
             changes: New values by the names of the parameters.
         """
-        bounds = {
-            f"{bound}_{name}": f"{value:g}"
-            for name, limits in self.ranges.items()
-            for bound, value in zip(("min", "max"), limits, strict=True)
-            if value is not None
-        }
-        values = {name: str(v) for name, v in {**self.values, **bounds, **changes}.items()}
+        values = {name: str(v) for name, v in {**self.values, **changes}.items()}
         return urlencode({n: v for n, v in values.items() if v not in ("", self.default.get(n))})
 
 
@@ -113,8 +103,7 @@ class Gallery(ABC):
         CHOICES: By the names of parameters, the values that can be chosen, besides class and
             object.
         SELECTS: Titles of the fields of the form, in order.
-        QUANTITIES: Numbers for filtering and sorting, with their display.
-        RANGES: Names of the quantities with a range among the filters.
+        QUANTITIES: Numbers for sorting, with their display.
         SORTS: Orders with their titles; the first is the default.
         OUTCOME: Outcome that is selected by default.
         snapshot: State of the dataset.
@@ -128,7 +117,6 @@ class Gallery(ABC):
     CHOICES: ClassVar[Mapping[str, Sequence[str]]]
     SELECTS: ClassVar[Mapping[str, str]]
     QUANTITIES: ClassVar[Mapping[str, Shown]] = {}
-    RANGES: ClassVar[Sequence[str]] = ()
     SORTS: ClassVar[Mapping[str, str]]
     OUTCOME: ClassVar[str] = ""
     snapshot: Snapshot
@@ -193,22 +181,20 @@ class Gallery(ABC):
         page = params.get("page", "") or "1"
         if not (page.isascii() and page.isdecimal() and len(page) < 9):
             raise DataError(f"page must be a number, got {page!r}")
-        limits = {n: (_number(params, f"min_{n}"), _number(params, f"max_{n}")) for n in cls.RANGES}
 
         default = {"outcome": cls.OUTCOME, "sort": next(iter(cls.SORTS)), "page": "1"}
         names = ("object", "class", "outcome", "sort", "order", "page", *cls.CHOICES)
         values = {name: params.get(name, "") or default.get(name, "") for name in names}
         values["page"] = str(max(1, int(page)))
         values["order"] = values["order"].replace("down", "")
-        ranges = {name: both for name, both in limits.items() if both != (None, None)}
-        return Query(values=values, ranges=ranges, default=default)
+        return Query(values=values, default=default)
 
     def select(self, query: Query) -> Places:
         """Return the rows that a query selects, in its order.
 
         Rows without a value of the sorted quantity come last; ties are in the order of the rows.
         """
-        # The filters; a row without a value is in no range.
+        # The filters.
         own = zip(self.snapshot.names, self.snapshot.classes, strict=True)
         asked = query["object"], query["class"]
         wanted = [all(a in ("", b) for a, b in zip(asked, names, strict=True)) for names in own]
@@ -216,12 +202,6 @@ class Gallery(ABC):
         for name in self.CHOICES:
             if query[name]:
                 chosen &= self.matches(name, query[name])
-        for name, (least, largest) in query.ranges.items():
-            values = self.column(name) * self.QUANTITIES[name].factor
-            if least is not None:
-                chosen &= values >= least
-            if largest is not None:
-                chosen &= values <= largest
 
         # The order.
         places = np.flatnonzero(chosen).astype(np.int32)
@@ -325,31 +305,9 @@ class Gallery(ABC):
             options = [(value, text, value == query[name]) for value, text in known.items()]
             selects.append((name, title, [(any_, "any", not query[name]), *options]))
 
-        # Numbers between two limits.
-        ranges = []
-        for name in self.RANGES:
-            bounds = query.ranges.get(name, (None, None))
-            least, largest = ("" if value is None else f"{value:g}" for value in bounds)
-            quantity = self.QUANTITIES[name]
-            ranges.append((name, quantity.title, quantity.unit, least, largest))
         return {
             "selects": selects,
-            "ranges": ranges,
             "sorts": [(name, text, name == query["sort"]) for name, text in self.SORTS.items()],
             "ascending": query.ascending,
             "outcome": self.OUTCOME,
         }
-
-
-def _number(params: Mapping[str, str], name: str) -> float | None:
-    """Return a number from an address; None if it has none."""
-    text = params.get(name, "").strip()
-    if not text:
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise DataError(f"{name} must be a number, got {text!r}")
-    return value

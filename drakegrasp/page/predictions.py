@@ -55,7 +55,7 @@ _MAY_LACK = tuple(replace(field, optional=field.name not in NEEDED) for field in
 NUMBERS = {field.name: field.shown for field in FIELDS.values() if field.shown is not None}
 #: Numbers that the dataset's own trial has as well.
 _BOTH = {field.name for field in TRIAL_FIELDS if field.shown == NUMBERS.get(field.name, 0)}
-#: Numbers of a prediction for filtering and sorting.
+#: Numbers of a prediction for sorting.
 QUANTITIES = {
     "contact_error": NUMBERS["contact_error"],
     "normal_error": NUMBERS["normal_error"],
@@ -72,8 +72,6 @@ WORDS = ("held", "success", "precision", "stable", "sample")
 VERDICTS = ("fails", *WORDS, "held_any")
 #: Kinds of contacts, and the columns of a verdict that contain them.
 _CONTACTS = {"requested": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_nhat_Q_O")}
-#: Width of the shown part of an image over that of its marks, and the smallest shown fraction.
-LOOSE, LEAST_SHOWN = 1.7, 0.4
 #: The largest force of a fingertip.
 _FORCE = Shown("largest force after closing", "N")
 
@@ -96,7 +94,6 @@ class Predictions(Gallery):
     }
     SELECTS: ClassVar = {name: name for name in ("verdict", "outcome", "class", "object")}
     QUANTITIES = QUANTITIES
-    RANGES = tuple(QUANTITIES)[:-1]
     SORTS: ClassVar = {
         "worst": "worst verdict",
         **{name: quantity.title for name, quantity in QUANTITIES.items()},
@@ -170,13 +167,11 @@ class Predictions(Gallery):
 
         for i, at, row in zip(shown.tolist(), places, rows, strict=True):
             verdict = self.verdict(i)
-            marks, size = self._marks(verdict, row, camera), snapshot.config.camera.size
             cards.append(
                 {
                     "strip": f"/strip/{at}-{camera}.png",
-                    "marks": marks,
-                    "window": _window(marks, size),
-                    "size": size,
+                    "marks": self._marks(verdict, row, camera),
+                    "size": snapshot.config.camera.size,
                     "verdict": self._verdict(i),
                     "reason": verdict["reason"] or "",
                     "numbers": [
@@ -189,15 +184,14 @@ class Predictions(Gallery):
     def row(self, i: int, hand: HandView) -> dict[str, Any]:
         """Return the content of a prediction's page."""
         # The verdict, the row, and where both cameras see the contacts, first the file's camera.
-        snapshot, at, size = self.snapshot, int(self._places[i]), self.snapshot.config.camera.size
+        snapshot, at = self.snapshot, int(self._places[i])
         verdict, (row,) = self.verdict(i), read_rows(snapshot, [at])
         views = []
         for camera in sorted(CAMERAS, key=lambda name: name != self.rows.camera):
             look = read_look(snapshot, at, camera)
             strip = f"/strip/{at}-{camera}.png"
             marks = self._marks(verdict, row, camera, look)
-            window = _window(marks, size, wide=camera != self.rows.camera)
-            views.append({"camera": camera, "strip": strip, "marks": marks, "window": window})
+            views.append({"camera": camera, "strip": strip, "marks": marks})
 
         return {
             "verdict": self._verdict(i),
@@ -208,7 +202,6 @@ class Predictions(Gallery):
             "row_page": f"/grasp/{at}",
             "views": views,
             "numbers": self._numbers(i, verdict, row),
-            "fingers": _fingers(verdict, row),
             "scene": self._scene(i, verdict, row, hand),
         }
 
@@ -320,40 +313,6 @@ def _largest(values: Any, count: int = 1) -> Array:
 
 def _outcome(outcome: int) -> str:
     return Outcome(int(outcome)).label.replace("_", " ")
-
-
-def _window(
-    marks: Mapping[str, list[Dot]], size: int, *, wide: bool = False
-) -> tuple[float, float, float]:
-    """Return the square of an image that shows its marks: left, top, and width [px].
-
-    Args:
-        marks: Marks by kind.
-        size: Width of the image [px].
-        wide: Whether to show the whole image.
-    """
-    dots = [(dot.u, dot.v) for of_kind in marks.values() for dot in of_kind]
-    if wide or not dots:
-        return -0.5, -0.5, float(size)
-    low, high = np.min(dots, axis=0), np.max(dots, axis=0)
-    width = min(max(LOOSE * float((high - low).max()), LEAST_SHOWN * size), float(size))
-    left, top = np.clip((low + high - width) / 2.0, -0.5, size - width - 0.5).tolist()
-    return left, top, width
-
-
-def _fingers(verdict: Mapping[str, Any], row: Mapping[str, Any]) -> list[list[str]]:
-    """Return the distances and forces of each finger as text."""
-    asked, reached, true = verdict["p_OQ"], verdict["closed_p_OQ"], row["closed_p_OQ"]
-    count = len(asked)
-    columns = [
-        (1e3, _lengths(None if reached is None else asked - reached)),
-        (1e3, _lengths(asked - true) if true.shape == asked.shape else None),
-        (1e3, verdict["surface_distance"]),
-        (1.0, _lengths(verdict["closed_f_Q_O"])),
-        (1.0, _lengths(row["closed_f_Q_O"])),
-    ]
-    known = [np.full(count, np.nan) if v is None else factor * v for factor, v in columns]
-    return [[f"{v[k]:.1f}" if np.isfinite(v[k]) else "–" for v in known] for k in range(count)]
 
 
 def _lengths(vectors: Array | None) -> Array | None:

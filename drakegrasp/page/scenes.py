@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.opening import refuse_other_codes
 from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
-from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS, Shown
+from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -21,8 +21,8 @@ from drakegrasp.pictures.style import REACHED, TRUE
 from drakegrasp.table import Table
 
 Rows = npt.NDArray[np.int64]
-#: Maximum number of palms in the 3D view, number of these with a hand, and lines of the table.
-PALMS, HANDS, LINES = 100, 8, 100
+#: Maximum number of palms in the 3D view, and number of these with a hand.
+PALMS, HANDS = 100, 8
 #: Length of the line along +Gz from a palm's origin on an image [m].
 PALM = 0.06
 #: Display of a grasp by its labels: the word, its style class, and the colour of its palm.
@@ -120,9 +120,6 @@ class Scenes(Gallery):
         return {
             "drawn": None if drawn is None else int(trials[drawn]),
             "views": [self._seen(i, k, drawn) for k in range(len(self.views(i)))],
-            "grasps": self._lines(i, grasps[:LINES]),
-            "more": max(0, len(grasps) - LINES),
-            "facts": self._facts(i),
             "looks": [HOLDS, FAILS, UNKNOWN],
             "scene": self._scene(i, grasps, hand),
         }
@@ -160,44 +157,12 @@ class Scenes(Gallery):
         places, views = grasps - self.data.rows_in(i)[:1], self.views(i).tolist()
         return np.array([self.data.visible_in(view)[places] for view in views])
 
-    def _lines(self, i: int, grasps: Rows) -> list[dict[str, Any]]:
-        """Return the lines of the table of grasps."""
-        table, lines = self.data.tables["grasps"], []
-        seen = self._visible(i, grasps).sum(axis=0) if len(grasps) else np.zeros((0, 0))
-        for row, views in zip(grasps.tolist(), seen.tolist(), strict=True):
-            trial, sample = int(table["trial_id"][row]), table["sample"][row]
-            # As on the pages of grasps: how well it holds, or else why it does not.
-            words = [name for name in ("stable", "precision", "held") if table[name][row]][:1]
-            words = words or [Outcome(int(table["outcome"][row])).label.replace("_", " ")]
-            lines.append(
-                {
-                    "trial": trial,
-                    "href": f"/grasp/{trial}",
-                    "holds": self._holds(row),
-                    "outcome": ", ".join([*words, *["sample"] * bool(sample)]),
-                    "seen": views,
-                }
-            )
-        return lines
-
     def _holds(self, row: int) -> tuple[str, str, str]:
         """Return the display of a grasp by its labels: HOLDS, FAILS or UNKNOWN."""
         table = self.data.tables["grasps"]
         if table["held"][row]:
             return HOLDS
         return FAILS if table["tested"][row] else UNKNOWN
-
-    def _facts(self, i: int) -> list[tuple[str, str]]:
-        """Return lines of name and value about what is on the table."""
-        values = {name: column[i] for name, column in self.data.tables["scenes"].items()}
-        x, y = unpack_pose(values["X_TO"][0])[:2, 3]
-        return [
-            ("mass", Shown("", "kg", 3).text(values["mass"][0])),
-            ("friction with the hand", f"{values['friction_hand'][0]:.3f}"),
-            ("friction with the table", f"{values['friction_table'][0]:.3f}"),
-            ("share of the drops that end so", f"{100.0 * values['probability'][0]:.0f} %"),
-            ("place on the table", f"({1e3 * x:.0f}, {1e3 * y:.0f}) mm"),
-        ]
 
     def _scene(self, i: int, grasps: Rows, hand: HandView) -> dict[str, Any]:
         """Return the 3D view: the hands of the best grasps, and further palms, in {T}."""

@@ -55,9 +55,7 @@ def test_the_worst_come_first(client: TestClient) -> None:
         ("verdict=precision", ["0"]),
         ("outcome=dropped", ["3"]),
         ("object=nothing", []),
-        ("class=box&min_contact_error=5", ["3", "1"]),
-        ("max_contact_error=5", ["0"]),
-        ("min_true_error=3.9&verdict=held", ["1", "0"]),
+        ("class=box&verdict=held", ["1", "0"]),
     ],
 )
 def test_filters_choose(client: TestClient, query: str, numbers: list[str]) -> None:

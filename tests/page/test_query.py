@@ -39,7 +39,6 @@ def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> lis
         ("object=nothing", []),
         ("split=none", []),
         ("removal=other_links", []),
-        ("min_slip=3", []),
     ],
 )
 def test_each_filter_chooses_its_own(snapshot: Snapshot, text: str, labels: list[str]) -> None:
@@ -71,21 +70,6 @@ def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
     assert set(chosen(changed, "split=none")) == {"0-0-0", "0-1-0"}
 
 
-def test_ranges_are_in_the_units_that_are_shown(snapshot: Snapshot) -> None:
-    """All slip by 2 mm; a slipped attempt of two fingers pushes with 12.5 N, too."""
-    for text, count in (
-        ("", 9),
-        ("outcome=any", 36),
-        ("min_slip=1.9&max_slip=2.1", 9),
-        ("max_slip=1.9", 0),
-        ("min_force=12.4&max_force=12.6", 9),
-        ("min_force=12.6&outcome=any", 0),
-    ):
-        assert len(chosen(snapshot, text)) == count, text
-    # What never closed has no penetration, so it is in no range.
-    assert len(chosen(snapshot, "max_penetration=100&outcome=any")) < 36
-
-
 def test_order_is_by_the_quantity_and_those_without_come_last(snapshot: Snapshot) -> None:
     score = snapshot.table.suspicion.copy()
     score[[0, 3, 11]] = [5.0, np.nan, 7.0]
@@ -110,7 +94,7 @@ def test_decisions_choose_what_is_left(snapshot: Snapshot) -> None:
 
 
 def test_address_of_a_query_gives_the_query_again() -> None:
-    text = "outcome=any&object=a%26b%3Dc&min_slip=1.5&sort=slip&order=up&page=3&hold=stable"
+    text = "outcome=any&object=a%26b%3Dc&sort=slip&order=up&page=3&hold=stable"
     query = Attempts.query(dict(parse_qsl(text)))
     assert Attempts.query(dict(parse_qsl(query.params()))) == query
     assert query["object"] == "a&b=c" and not query["outcome"]
@@ -122,8 +106,6 @@ def test_address_of_a_query_gives_the_query_again() -> None:
     [
         ("outcome=good", "outcome must be one of any, success, .* got 'good'"),
         ("sort=x", "sort must be one of"),
-        ("min_slip=much", "min_slip must be a number, got 'much'"),
-        ("max_slip=nan", "max_slip must be a number"),
         ("page=-1", "page must be a number"),
     ],
 )

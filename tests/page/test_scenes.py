@@ -115,13 +115,14 @@ def test_page_shows_the_best_hands_first_and_all_palms(client: TestClient, made:
     wanted = [look[2] for look, count in looks for _ in range(count)]
     assert colours == wanted and len(set(colours)) > 1
     assert sorted(palm["p"] for palm in scene["palms"]) == sorted(p_TG.astype(float).tolist())
-    # The hands are those of the file, and the lines lead to the pages of their trials.
+    # The hands are those of the file, and a link leads to the page of the best.
     state = scene["states"][f"trial {trial[np.argmax(held)]}"]
     found = [contact["p"] for contact in state["contacts"]]
     assert found == points[np.argmax(held)].astype(float).tolist() and len(state["links"]) > 5
-    links = [a["href"] for tag, a in Tags(page).tags if tag == "a" and "/grasp/" in str(a["href"])]
-    assert len(links) == len(trial)
-    assert all(client.get(str(address)).status_code == 200 for address in links[:2])
+    (link,) = [
+        a["href"] for tag, a in Tags(page).tags if tag == "a" and "/grasp/" in str(a["href"])
+    ]
+    assert client.get(link).status_code == 200
 
 
 def damage(path: Path) -> None:

@@ -2,7 +2,6 @@
 // the cards, and nothing else. The address keeps the state.
 "use strict";
 (() => {
-  const TYPING = 300;
   const form = document.getElementById("filters");
   if (!form) return;
   const message = document.getElementById("message"), told = document.getElementById("told");
@@ -10,15 +9,6 @@
   // What is chosen, without empty fields.
   function chosen() {
     return new URLSearchParams([...new FormData(form)].filter(([, value]) => value.trim() !== ""));
-  }
-
-  // A range must be of numbers; what is wrong with it is said.
-  function isReadable() {
-    const wrong = [...form.elements].filter((field) => field.inputMode === "decimal" && Number.isNaN(Number(field.value)));
-    message.hidden = !wrong.length;
-    message.className = "bad";
-    message.textContent = wrong.map((field) => `${field.getAttribute("aria-label")} must be a number, got ${field.value}`).join("; ");
-    return !wrong.length;
   }
 
   function fill(params) {
@@ -57,18 +47,12 @@
     main.removeAttribute("aria-busy");
   }
 
-  // Text is complete when nothing was typed for a moment, or at Enter.
-  let timer = 0, last = chosen().toString();
+  let last = chosen().toString();
   function act() {
-    clearTimeout(timer);
-    if (!isReadable() || chosen().toString() === last) return;
+    if (chosen().toString() === last) return;
     last = chosen().toString();
     load(`${form.action}?${last}`, true);
   }
-  form.addEventListener("input", (event) => {
-    clearTimeout(timer);
-    timer = setTimeout(act, event.target.tagName === "SELECT" ? 0 : TYPING);
-  });
   form.addEventListener("change", act);
   form.addEventListener("submit", (event) => { event.preventDefault(); act(); });
   document.getElementById("reset").addEventListener("click", (event) => {
