@@ -32,7 +32,6 @@ def audit(
     manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
     hand: Annotated[str | None, Parameter(metavar="NAME|YAML")] = None,
     json_file: Annotated[NewFile | None, Parameter(name="--json")] = None,
-    sheet: NewFile | None = None,
 ) -> None:
     """Check which meshes are fit, repaired or refused.
 
@@ -48,12 +47,11 @@ def audit(
         hand: Hand whose opening and stand-offs are compared with the objects' sizes. [default:
             barrett]
         json_file: Write all findings as JSON.
-        sheet: Write a picture of every object with its status (.png).
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
     from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.objects.audit import audit as audit_meshes
-    from drakegrasp.runtime.files import atomic_path, write_atomic
+    from drakegrasp.runtime.files import write_atomic
 
     own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"] if hand else []).hand_source)
     limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
@@ -68,11 +66,6 @@ def audit(
     if json_file is not None:
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)
         write_atomic(json_file, f"{text}\n".encode())
-    if sheet is not None:
-        from drakegrasp.pictures.rendered import object_sheet
-
-        with progress_bar("draw", "objects") as progress, atomic_path(sheet) as png:
-            object_sheet(rows, png, progress=progress)
     if all(row.status == "refused" for row in rows):
         sys.exit(1)
 

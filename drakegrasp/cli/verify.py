@@ -304,7 +304,7 @@ def place(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config, Predic
     from drakegrasp.dataset.reader import PredictedRows
     from drakegrasp.exchange.attempts import has_rows, holds_postures
     from drakegrasp.exchange.columns import read_numbers
-    from drakegrasp.simulation.attempts import Attempts, ranked
+    from drakegrasp.simulation.attempts import ranked
 
     with wrong_input():
         postures = holds_postures(path)
@@ -334,8 +334,6 @@ def place(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config, Predic
         # Invalid contacts are failures of a network, but such postures belong elsewhere.
         if postures and all(grasp.invalid for grasp in placed):
             raise GraspError(f"{path}: {placed[0].invalid}")
-        if isinstance(table, Attempts):
-            _say_all(table.nameless if data is None else "", table.bare)
         _say_all(table.left_out)
         if data is None:
             return placed, config, None

@@ -66,7 +66,6 @@ def figures(
         outcomes       how the attempts ended: samples, removed, failed
         objects        samples of each object, and how many are distinct
         distributions  slip, turn, forces of the samples
-        views          views of scenes with a sample of each, if there are scenes
 
     Args:
         out: Directory of the dataset.

@@ -51,7 +51,7 @@ class Counts:
         self._pool, self._report, self._target = pool, report, target
         self._palms = sum(entry.candidates for entry in manifest.objects)
         self._outcomes: Counter[Outcome] = Counter()
-        self._done = self._before = 0
+        self._done = 0
 
         # For each object: all attempts, and those that ended because of the machine.
         self._attempts: Counter[str] = Counter()
@@ -67,8 +67,6 @@ class Counts:
         self._done += header.stop - header.start
         self._attempts[header.object_name] += sum(outcomes.values())
         self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
-        if reused:
-            self._before = self._progress()[0]
         self.show()
 
     def unexplained(self) -> list[str]:
@@ -93,7 +91,7 @@ class Counts:
         if self._pool is not None:
             figures["workers"] = self._pool.size
         done, total = self._progress()
-        self._report(done, total, found=self._before, **figures)
+        self._report(done, total, **figures)
 
     def _progress(self) -> tuple[int, int | None]:
         """Return how much is done, and how much is due; None until each object has been tried."""

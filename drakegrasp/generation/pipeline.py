@@ -162,11 +162,9 @@ class _Build:
         # Prepare each object, or reject its mesh.
         with self._progress("prepare", "objects") as report:
             self._prepare(sources, report)
-        if self._postures is not None:
-            table = self._postures
-            for told in filter(None, (_refused(table, self._manifest), table.nameless, table.bare)):
-                self._say(told)
-                self._notices.append(told)
+        if self._postures and (refused := _refused(self._postures, self._manifest)):
+            self._say(refused)
+            self._notices.append(refused)
 
         # Simulate the missing work units; remove the temporary files of killed workers.
         what = "samples" if self._config.has_target else "palms"
@@ -221,8 +219,7 @@ class _Build:
             entry = _known_entry(source, before.get(source.name), self._out, self._config)
             if entry is not None:
                 entries[source.name] = entry
-        reused = len(entries)
-        report(reused, len(sources), found=reused)
+        report(len(entries), len(sources))
 
         # Prepare the others, in any order.
         tasks = [
@@ -238,7 +235,7 @@ class _Build:
         ]
         for name, entry in self._execute(prepare_one, tasks):
             entries[name] = entry
-            report(len(entries), len(sources), found=reused)
+            report(len(entries), len(sources))
 
         # If a mesh has changed, its rows and its rejected grasps no longer exist.
         same = {n for n, e in before.items() if entries[n].mesh_sha256 == e.mesh_sha256}

@@ -22,9 +22,6 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import listed
 
-#: An object has much more than its share if it has more than this multiple of it.
-MUCH = 2
-
 
 @dataclass(eq=False)
 class _Object:
@@ -213,7 +210,7 @@ class Target:
             yield best[1]
 
     def warnings(self) -> list[str]:
-        """Return lines that state which part of the target was not reached, and what is uneven."""
+        """Return lines that state which part of the target was not reached."""
         config, lines = self._config, list[str]()
         counts, spent, vain = dict[str, int](), list[str](), list[str]()
         shares = self._even_shares(whole=True)
@@ -234,17 +231,6 @@ class Target:
                 if names:
                     said = listed([f"{name} ({counts[name]:,})" for name in names])
                     lines.append(f"too few samples, {why}: {said}")
-
-        # A few objects may have to make up for the others.
-        share = self.wanted / max(len(counts), 1)
-        large = [name for name, count in counts.items() if count > MUCH * share]
-        fewer = [self._objects[name] for name, count in counts.items() if count < share]
-        if large and all(item.end is not None for item in fewer):
-            said = listed([f"{name} ({counts[name]:,})" for name in large])
-            lines.append(
-                f"more than twice their share of {share:.3g} samples, because the other objects "
-                f"yielded no more: {said}"
-            )
         return lines
 
     def _taken(self, shares: Mapping[str, int]) -> dict[str, int | None]:

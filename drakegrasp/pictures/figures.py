@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
+from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, counted
@@ -33,7 +33,7 @@ from drakegrasp.pictures.charts import (
     draw_distributions,
     draw_objects,
 )
-from drakegrasp.pictures.sheets import sample_sheet, scene_views
+from drakegrasp.pictures.sheets import sample_sheet
 from drakegrasp.pictures.style import png_bytes, svg_bytes
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
@@ -119,11 +119,8 @@ def write_figures(
         "outcomes": lambda: _outcomes(funnel),
         "objects": lambda: _objects(samples, funnel),
         "distributions": lambda: _distributions(samples, funnel),
-        "views": lambda: scene_views(out / SCENES_FILE),
     }
     known = {*drawings}
-    if not (out / SCENES_FILE).exists():
-        del drawings["views"]  # most datasets have no scenes
 
     # A figure is drawn if there are data.
     written, numbers = Written(folder=folder), {}

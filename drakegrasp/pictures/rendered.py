@@ -1,16 +1,13 @@
-"""Pictures that Drake renders: a hand, and the objects of an audit.
+"""Pictures of a hand, which Drake renders.
 
-Input: a hand, or the rows of an audit. Output: figures. As in `vision.rendering`, all pictures must
-be rendered in one thread.
+Input: a hand. Output: a figure. As in `vision.rendering`, all pictures must be rendered in one thread.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from pydrake.geometry import Cylinder, LightParameter
@@ -18,20 +15,15 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drakegrasp.arithmetic import norm
-from drakegrasp.config import CameraConfig
 from drakegrasp.frames import (
     Array,
     invert_pose,
-    make_pose,
     transform_points,
 )
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import link_points
 from drakegrasp.hand.kinematics import closed_positions
 from drakegrasp.hand.shapes import pad_surfaces
-from drakegrasp.objects.audit import AuditRow
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.still_scene import (
     Lighting,
     Poses,
@@ -43,13 +35,9 @@ from drakegrasp.pictures.style import (
     INK,
     add_axes,
     hide_ticks,
-    new_page,
     save_figure,
-    shortened,
-    write_beside,
 )
-from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.vision.rendering import build_renderer, drawn_mesh, render
+from drakegrasp.vision.rendering import drawn_mesh
 
 #: Fraction by which the hand has closed in each panel, and the title of the panel.
 PANELS = ((0.0, "open"), (0.5, "half closed"), (1.0, "closed"))
@@ -75,19 +63,6 @@ HAND_PIXELS, INCHES = 480, 2.4
 SPACE = 5
 #: Direction of the camera: beside the line along which fingers close, and above [rad].
 AZIMUTH, ELEVATION = np.deg2rad(25.0), np.deg2rad(20.0)
-#: Number of objects in a row, the edge of a picture [inch], and its pixels.
-ACROSS, OBJECT, OBJECT_PIXELS = 8, 1.45, 220
-#: Direction from which an object is seen, in the table-top frame: from the front right, from above.
-TOWARDS_CAMERA = np.array([0.62, -0.62, 0.48])
-#: Vertical field of view [deg], and the fraction of it that an object's bounding sphere fills.
-FIELD_DEG, FILL = 30.0, 0.95
-#: Colours of the status (Okabe and Ito: safe for the colour-blind).
-STATUS_COLOURS = {"fit": "#009E73", "repaired": "#B07A00", "refused": "#D55E00"}
-#: Characters of a name that fit above a picture, and of a reason that fit in a line of a picture.
-NAME, LINE = 24, 24
-
-
-# A hand.
 
 
 def picture_hand(hand: Hand, png: Path, *, across: float) -> None:
@@ -174,79 +149,3 @@ def _surface(scene: StillScene, q: Array) -> Array:
     return np.concatenate(
         [transform_points(scene.link_pose(link), points[link]) for link in scene.hand.link_chains]
     )
-
-
-# The objects of an audit.
-
-
-def object_sheet(rows: Sequence[AuditRow], png: Path, *, progress: Report = silent) -> None:
-    """Draw the objects of an audit, oriented as in their files, each at its own scale.
-
-    Args:
-        rows: Rows of the audit; a rejected mesh is shown by its reason instead of a picture.
-        png: Path of the file to write.
-        progress: Called after each object.
-    """
-    # The page.
-    across = min(ACROSS, len(rows))
-    lines = -(-len(rows) // across)
-    gap, caption, margin = 0.12, 0.36, 0.15
-    width = across * OBJECT + (across - 1) * gap + 2 * margin
-    height = lines * (OBJECT + caption) + 2 * margin
-    figure = new_page(width, height)
-
-    for i, row in enumerate(rows):
-        line, column = divmod(i, across)
-        left, top = margin + column * (OBJECT + gap), margin + line * (OBJECT + caption) + caption
-        axes = add_axes(figure, left, top, OBJECT, OBJECT)
-        hide_ticks(axes)
-        if row.model is not None:
-            axes.imshow(draw_object(row.model), interpolation="bilinear")
-        else:
-            axes.set_facecolor("#f4f1ee")
-            centred = {"ha": "center", "va": "center"}
-            write_beside(axes, 0.5, 0.5, _wrapped(row.notes[0]), 4.6, **centred)
-
-        # The name, and the status below it.
-        status = row.status + (" !" if row.warnings else "")
-        write_beside(axes, 0.0, 1.135, shortened(row.name, NAME), 6.2)
-        write_beside(axes, 0.0, 1.02, status, 6.2, color=STATUS_COLOURS[row.status])
-        progress(i + 1, len(rows))
-    save_figure(figure, png, dpi=150)
-
-
-def draw_object(model: ObjectModel) -> npt.NDArray[np.float32]:
-    """Return a picture (s, s, 3) in 0..1 of an object that is oriented as in its file."""
-    # The distance at which the sphere around the object fills the picture.
-    radius = float(norm(model.half_extents))
-    distance = radius / np.sin(np.deg2rad(FIELD_DEG) / 2.0) / FILL
-    camera = CameraConfig(
-        size=OBJECT_PIXELS, fov_y_deg=FIELD_DEG, near=0.02 * distance, far=20.0 * distance
-    )
-
-    height = float(model.half_extents[2])
-    X_TO = make_pose(np.eye(3), [0.0, 0.0, height])
-    back = TOWARDS_CAMERA / norm(TOWARDS_CAMERA)
-    X_TC = make_pose(_looking_along(-back), X_TO[:3, 3] + distance * back)
-    view = render(build_renderer(model, camera), X_TO, X_TC)
-    return np.asarray(np.moveaxis(view.image[:3], 0, 2))
-
-
-def _looking_along(z: Array) -> Array:
-    """Return the rotation (3, 3) of a camera that looks along z (3,), with world up at the top.
-
-    Camera axes are OpenCV's: +x right, +y down, +z forward.
-    """
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x = x / norm(x)
-    return np.column_stack((x, np.cross(z, x), z))
-
-
-def _wrapped(text: str) -> str:
-    """Return a reason in lines that fit into the space of a picture."""
-    lines = [""]
-    for word in text.split():
-        if len(lines[-1]) + len(word) >= LINE and lines[-1]:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    return "\n".join(lines[:12])

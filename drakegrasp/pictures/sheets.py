@@ -10,39 +10,27 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drakegrasp.dataset.reader import GraspDataset, Sample
-from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError, counted
 from drakegrasp.frames import Array
 from drakegrasp.pictures.style import (
-    ARROW,
     INK,
     add_axes,
     draw_colour_bar,
     draw_finger_legend,
     draw_sample,
-    frame_image,
-    mark_contact,
     new_page,
     read_far,
-    shortened,
     write_beside,
 )
-from drakegrasp.vision.camera import project
 
 #: Samples per line of a sheet, and the edge of each of its images [inch].
 ACROSS, EDGE = 3, 1.12
 #: Number of samples on the sheet of a dataset, and the most if it has more objects than that.
 PLACES, MOST = 24, 60
-#: Sheet of scenes: scenes of each split, views of a scene, and the width of a view [inch].
-SCENES = {"train": 4, "valid": 1, "test": 2}
-VIEWS, WIDE = 4, 1.9
-#: Length of the line along +Gz from the palm's origin [m].
-PALM = 0.06
 
 
 def draw_sheet(
@@ -162,64 +150,3 @@ def _natural(name: str) -> tuple[int, str]:
     """Return the sorting key of a name: its leading number, then the rest."""
     number, _, rest = name.partition("_")
     return (int(number), rest) if number.isdecimal() else (10**9, name)
-
-
-def scene_views(path: Path) -> tuple[Figure, list[dict[str, int]]]:
-    """Return the sheet of scenes, and for each view its row of /views and the sample's trial id.
-
-    The scenes have different objects, evenly spaced in the order of names. The sample is the first
-    of its scene.
-
-    Raises:
-        DataError: If the file is missing or damaged, or has no scene with a sample.
-    """
-    lines = []
-    for split in SPLITS:
-        data = SceneDataset(path, points=None, split=split, negatives="none", grasps=1)
-        if not len(data):
-            continue
-        scenes = data.tables["views"]["scene"][data.views]
-        objects = data.tables["scenes"]["object"][scenes, 0]
-        _, first = np.unique(objects, return_index=True)
-        picked = np.linspace(0, len(first) - 1, min(SCENES[split], len(first))).round().astype(int)
-        lines += [(data, data.views[scenes == scenes[i]][:VIEWS]) for i in first[picked]]
-    if not lines:
-        raise DataError(f"{path}: must have a scene with a sample, got none")
-
-    # The page.
-    high, caption, head, margin, gap = 0.75 * WIDE, 0.2, 0.3, 0.12, 0.04
-    width = VIEWS * (WIDE + gap) + 2 * margin
-    height = len(lines) * (high + caption) + head + margin
-    figure, drawn = new_page(width, height), []
-    for line, (data, views) in enumerate(lines):
-        top = head + line * (high + caption) + caption
-        for column, view in enumerate(views.tolist()):
-            axes = add_axes(figure, margin + column * (WIDE + gap), top, WIDE, high)
-            trial, name = _draw_view(axes, data, view)
-            drawn.append({"view": view, "trial_id": trial})
-            if column == 0:
-                text = f"{shortened(name, 30).replace('_', ' ')}, {data.split}, trial {trial}"
-                write_beside(axes, 0.0, 1.03, text, 7.0)
-    fingers = lines[0][0].tables["grasps"]["p_TQ"].shape[1]
-    draw_finger_legend(figure, fingers, (margin / width, 1.0 - 0.08 / height), 7.0)
-    return figure, drawn
-
-
-def _draw_view(axes: Axes, data: SceneDataset, view: int) -> tuple[int, str]:
-    """Draw a view with the first sample of its scene; return the trial id and the object's name."""
-    images, grasps = data.images(view), data.grasps_in(view, frame="camera")
-    row = int(np.argmax(grasps["sample"]))
-    axes.imshow(images["rgb"], interpolation="nearest")
-    K, X_CG = images["K"].astype(float), grasps["X_AG"][row].astype(float)
-    palm = project(K, np.array([X_CG[:3, 3], X_CG[:3, 3] + PALM * X_CG[:3, 2]]))
-    axes.plot(*palm.T, color=INK, linewidth=1.6)
-    axes.plot(*palm[0], marker="s", markersize=4.0, color=INK)
-
-    # The contacts; they are hollow if the file says that the camera does not see them.
-    p_CQ, nhat = grasps["p_AQ"][row].astype(float), grasps["nhat_Q_A"][row].astype(float)
-    for i in np.flatnonzero(np.isfinite(p_CQ).all(axis=1)).tolist():
-        dot, end = project(K, np.array([p_CQ[i], p_CQ[i] + ARROW * nhat[i]]))
-        mark_contact(axes, i, dot, end, hidden=not grasps["visible"][row, i], scale=0.8)
-    frame_image(axes, *images["mask"].shape)
-    number = int(data.tables["scenes"]["object"][data.tables["views"]["scene"][view], 0])
-    return int(grasps["trial_id"][row]), data.names[number]

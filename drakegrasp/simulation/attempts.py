@@ -195,29 +195,6 @@ class Attempts(GraspRows):
         """Return whether a row names its resting pose."""
         return bool(np.isfinite(self.X_TO[i]).all() or self.resting[i] != UNTOLD)
 
-    @property
-    def nameless(self) -> str:
-        """A message on the rows that name no resting pose; empty if there are none."""
-        rows = [i for i in range(len(self)) if not (self.invalid[i] or self.names_pose(i))]
-        if not rows:
-            return ""
-        return (
-            f"{len(rows):,} of {len(self):,} rows of the postures name no resting pose: each is "
-            "tried in all that are known of its object (objects.resting_poses drops more)"
-        )
-
-    @property
-    def bare(self) -> str:
-        """A message on the rows that are palm poses alone; empty if there are none."""
-        without = np.isnan(self.q_grasp).all(axis=1)
-        rows = [i for i in np.flatnonzero(without) if not self.invalid[i]]
-        if not rows:
-            return ""
-        return (
-            f"{len(rows):,} of {len(self):,} rows of the postures have a palm pose and no joints: "
-            "the open hand closes"
-        )
-
     def shapes(self, i: int, hand: Hand) -> tuple[str, ...]:
         """Return the preshapes in which a row is tried: the one that it names, or each preshape."""
         return hand.preshape_names if self.preshape[i] == EACH else (self.preshape[i],)

@@ -86,18 +86,6 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.X_OG)
 
-    def palm_distance(
-        self, candidate: npt.NDArray[np.int64], standoff: npt.NDArray[np.float64]
-    ) -> Array:
-        """Return how far the palms of attempts (n,) are from the surface along +Gz [m].
-
-        Args:
-            candidate: (n,), index of each attempt's palm.
-            standoff: (n,), stand-off to which a palm was moved [m]; a palm with a spread was not.
-        """
-        as_it_is = np.isfinite(self.spread[candidate])
-        return np.where(as_it_is, self.distance[candidate], standoff)
-
 
 #: The shape of a palm whose spread and preshape are drawn for each attempt.
 DRAWN = Shape(None, np.nan)

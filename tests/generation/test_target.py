@@ -198,15 +198,6 @@ def test_new_object_fills_up_while_others_stay() -> None:
     assert found == {"rich": 30, "poor": 5}
 
 
-def test_one_object_that_makes_up_for_others_is_told() -> None:
-    target = make_target(samples=100)
-    found = samples(run(target))
-    assert sum(found.values()) == 100
-    (line,) = target.warnings()
-    assert line.startswith("more than twice their share of 25 samples, because the other objects ")
-    assert "rich (57)" in line
-
-
 def test_what_was_there_before_is_nobodys_larger_share() -> None:
     """A smaller target, or new objects: the others are not exhausted."""
     target = make_target({"rich": 30, "poor": 0}, samples=8)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,14 +11,11 @@ from helpers.golden import Golden, drawn, points
 from matplotlib.figure import Figure
 from pydrake.geometry import Cylinder, Role
 
-from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.objects.audit import AuditRow
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures import figures, rendered
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
-from drakegrasp.pictures.rendered import object_sheet, picture_hand
+from drakegrasp.pictures.rendered import picture_hand
 from drakegrasp.pictures.still_scene import StillScene, camera_pose
 from drakegrasp.vision.camera import Picture
 
@@ -78,33 +74,6 @@ def test_hand_with_its_pads_and_frames(
     monkeypatch.setattr(rendered, "save_figure", save)
     picture_hand(load_hand("franka"), tmp_path / "hand.png", across=np.deg2rad(30.0))
     golden("figures/hand", "\n".join(lines))
-
-
-def test_objects_of_an_audit(
-    cube: ObjectModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, golden: Golden
-) -> None:
-    """Each is seen by a camera at a distance at which it fills the picture."""
-    lines: list[str] = []
-
-    def render(lens: CameraConfig, X_TO: Array, X_TC: Array) -> SimpleNamespace:
-        lines.append(f"{lens.size} {lens.fov_y_deg} {points([[lens.near, lens.far]])}")
-        lines.append(f"{points(X_TO)} {points(X_TC)}")
-        image = np.arange(48.0).reshape(4, 3, 4) / 48.0
-        return SimpleNamespace(image=image)
-
-    def save(figure: Figure, *_: object, **__: object) -> None:
-        lines.append(drawn(figure))
-
-    monkeypatch.setattr(rendered, "build_renderer", lambda model, camera: camera)
-    monkeypatch.setattr(rendered, "render", render)
-    monkeypatch.setattr(rendered, "save_figure", save)
-    long = " ".join(["its faces are open,"] * 18)
-    status = [("fit", cube), ("refused", None)] * 5
-    rows = [AuditRow(name=f"{i}_a_name_that_is_too_long_to_fit", class_name="", status=word,
-                     notes=(long,), warnings=("w",) * (i % 2), model=model)
-            for i, (word, model) in enumerate(status)]  # fmt: skip
-    object_sheet(rows, tmp_path / "sheet.png")
-    golden("figures/audit", "\n".join(lines))
 
 
 def test_camera_of_a_still_scene() -> None:

@@ -17,18 +17,15 @@ from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import create_field
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
-from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.pictures import sheets
 from drakegrasp.pictures.sheets import (
     draw_sheet,
     sample_sheet,
-    scene_views,
     spread_over_objects,
 )
 from drakegrasp.pictures.style import draw_contacts
@@ -214,29 +211,6 @@ def test_a_finger_that_a_grasp_leaves_out_is_not_drawn() -> None:
     assert "contact 1" not in {line.get_gid() for line in axes.lines}
 
 
-@pytest.mark.sim
-def test_each_view_shows_the_contacts_of_a_sample_of_its_scene(out: Path) -> None:
-    make_scenes(out, overrides=["scenes.views=3"])
-    path = out / "scenes.hdf5"
-    figure, drawn = scene_views(path)
-    # Three drawn views of the object to train on, four of each to test.
-    assert len(drawn) == len(figure.axes) == 3 + 4 + 4
-    data = SceneDataset(path, points=None, split="train")
-    for axes, told in zip(figure.axes, drawn, strict=True):
-        grasps = data.grasps_in(told["view"])
-        row = int(np.argmax(grasps["trial_id"] == told["trial_id"]))
-        assert grasps["sample"][row]
-        dots = {line.get_gid(): line for line in axes.lines if line.get_gid()}
-        hollow = [dots[f"contact {i}"].get_markerfacecolor() == "white" for i in range(3)]
-        assert hollow == (~grasps["visible"][row]).tolist()
-        # Only the image is in the picture, without ticks and a frame.
-        height, width = data.images(told["view"])["mask"].shape
-        assert axes.get_xlim() == (-0.5, width - 0.5) and axes.get_ylim() == (height - 0.5, -0.5)
-        assert not axes.get_xticks().size and not axes.spines["left"].get_visible()
-    assert any(not data.grasps_in(told["view"])["visible"].all() for told in drawn)
-
-
 def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
-    for draw, line in ((sample_sheet, "a data file"), (scene_views, "the scenes of a dataset")):
-        with pytest.raises(DataError, match=rf"missing\.hdf5: must be {line}"):
-            draw(tmp_path / "missing.hdf5")
+    with pytest.raises(DataError, match=r"missing\.hdf5: must be a data file"):
+        sample_sheet(tmp_path / "missing.hdf5")
