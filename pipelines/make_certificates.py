@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from drakegrasp.cli.arguments import Folder
 from drakegrasp.cli.console import run_command, say
 from drakegrasp.cli.help import new_group
-from drakegrasp.cluster.certificates import make_certificates
+from drakegrasp.cluster.connect import make_certificates
 from drakegrasp.errors import MachineError
 
 app = new_group("make_certificates", __doc__)

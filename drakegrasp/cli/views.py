@@ -42,7 +42,7 @@ def inspect(
     from drakegrasp.errors import MachineError, one_line
 
     try:
-        from drakegrasp.page.serve import serve
+        from drakegrasp.page.app import serve
     except ImportError as error:
         if (error.name or "").partition(".")[0] == "drakegrasp":
             raise

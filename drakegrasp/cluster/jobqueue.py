@@ -28,8 +28,13 @@ from distributed import Client, SpecCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
-from drakegrasp.cluster.certificates import made_or_given, security_of
-from drakegrasp.cluster.connect import LOOPBACK, closing_cluster, dask_settings
+from drakegrasp.cluster.connect import (
+    LOOPBACK,
+    closing_cluster,
+    dask_settings,
+    made_or_given,
+    security_of,
+)
 from drakegrasp.cluster.kinds import OPTIONS, Local, memory_bytes
 from drakegrasp.errors import ConfigError, MachineError, counted, one_line
 

@@ -15,8 +15,7 @@ from typing import ClassVar
 from dask.utils import parse_bytes
 from distributed import Client
 
-from drakegrasp.cluster.certificates import chosen_security
-from drakegrasp.cluster.connect import connect, refuse_open
+from drakegrasp.cluster.connect import chosen_security, connect, refuse_open
 from drakegrasp.errors import ConfigError, counted
 from drakegrasp.runtime.executor import count_workers
 

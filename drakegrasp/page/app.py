@@ -1,4 +1,4 @@
-"""The web application: its addresses, and its protection against other sites and machines.
+"""The web application: its addresses, its changes, and its protection against others.
 
 Every answer forbids scripts, styles and requests other than to the server itself. The Host header
 must name this machine, so a foreign name that resolves to this machine (DNS rebinding) gets
@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import os
 import secrets
+import socket
+import sys
 import threading
+import webbrowser
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -28,10 +32,16 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, SCENES_FILE
+from drakegrasp.dataset.rejections import (
+    FILE_NAME,
+    AttemptKey,
+    Decisions,
+    read_decisions,
+    write_decisions,
+)
 from drakegrasp.dataset.trials import stamp
 from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.foreign_files import parse_json
-from drakegrasp.page.actions import DecisionFile
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.catalog import read_snapshot
 from drakegrasp.page.gallery import Gallery, render
@@ -41,8 +51,10 @@ from drakegrasp.page.scenes import Scenes
 from drakegrasp.pictures.style import colour_png, strip_png
 
 ASSETS = Path(__file__).parent / "static"
+#: The only address that the server listens on.
+LOOPBACK = "127.0.0.1"
 #: Names of this machine that a browser may have requested.
-HOSTS = ("127.0.0.1", "localhost")
+HOSTS = (LOOPBACK, "localhost")
 TOKEN_HEADER = "x-drakegrasp-token"
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -57,6 +69,74 @@ HEADERS = {
 #: Maximum size of a POST [B].
 MAX_BODY = 4096
 Params: TypeAlias = Mapping[str, str]
+
+
+class Step(NamedTuple):
+    """A change of the decision on an attempt."""
+
+    key: AttemptKey
+    before: str
+    after: str
+
+
+class DecisionFile:
+    """`reject.json` of a dataset, which is read before each change, and written with it.
+
+    Args:
+        out: Directory of the dataset.
+
+    Raises:
+        DataError: If the file exists and cannot be read.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self._path = out / FILE_NAME
+        self._lock = threading.Lock()
+        self._last: Step | None = None
+        self.read()
+
+    def read(self) -> Decisions:
+        """Return the decisions on disk.
+
+        Raises:
+            DataError: If the file cannot be read.
+        """
+        return read_decisions(self._path)
+
+    def decide(self, key: AttemptKey, decision: str) -> Decisions:
+        """Write a decision and return all decisions including it.
+
+        Args:
+            key: The attempt.
+            decision: `rejected`, or empty text to withdraw that.
+
+        Raises:
+            ValueError: If the text is not a decision.
+            DataError: If the file is no longer a list of rejections.
+            OSError: If the file cannot be written.
+        """
+        with self._lock:
+            decisions = self.read()
+            before, changed = decisions.of(key), decisions.with_decision(key, decision)
+            if decision != before:
+                write_decisions(self._path, changed)
+                self._last = Step(key, before, decision)
+            return changed
+
+    def undo(self) -> Step | None:
+        """Withdraw the last decision and return it; None if there is none, or it stands no more.
+
+        Raises:
+            DataError: If the file is no longer a list of rejections.
+            OSError: If the file cannot be written.
+        """
+        with self._lock:
+            last, self._last = self._last, None
+            decisions = self.read()
+            if last is None or decisions.of(last.key) != last.after:
+                return None
+            write_decisions(self._path, decisions.with_decision(last.key, last.before))
+            return last
 
 
 class Inspection:
@@ -319,3 +399,67 @@ def _error(request: Request, error: Exception) -> Response:
         return JSONResponse({"error": text}, status_code=status)
     page = render("error.html", [], title="error", text=text)
     return HTMLResponse(page, status_code=status)
+
+
+# Serving, to this machine only.
+
+
+def serve(
+    out: Path,
+    *,
+    results: Path | None = None,
+    port: int,
+    browser: bool,
+    announce: Callable[[str], None],
+) -> None:
+    """Serve the pages of a dataset until Ctrl-C.
+
+    Args:
+        out: Directory of the dataset.
+        results: File of the verdicts on predictions for the dataset's rows, if there is one.
+        port: TCP port; 0 takes any free port.
+        browser: Whether to open a browser.
+        announce: Called with the address as soon as the server answers.
+
+    Raises:
+        DataError: If there is no dataset, the verdicts belong to another dataset, or the port is
+            taken.
+    """
+    # Check everything first; the page must be fast from its first request on.
+    inspection = Inspection(out, results)
+    with listen(port) as listener:
+        inspection.warm_up()
+        page = "" if results is None else "predictions"
+        address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/{page}"
+        announce(address)
+        if browser and has_screen():
+            webbrowser.open(address)
+        config = uvicorn.Config(make_app(inspection), log_level="warning", access_log=False)
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+def listen(port: int) -> socket.socket:
+    """Return a socket that listens on the loopback address.
+
+    Raises:
+        DataError: If the port is taken, or needs rights that this process does not have.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((LOOPBACK, port))
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise DataError(
+            f"--port must be free on this machine, got {port} ({error.strerror}); "
+            "--port 0 takes any that is"
+        ) from None
+    return listener
+
+
+def has_screen() -> bool:
+    """Return whether a browser would open a window instead of taking over the terminal."""
+    if sys.platform == "darwin":
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,6 +1,7 @@
 """Pictures of a hand, which Drake renders.
 
-Input: a hand. Output: a figure. As in `vision.rendering`, all pictures must be rendered in one thread.
+Input: a hand. Output: a figure. As in `vision.rendering`, all pictures must be rendered in one
+thread.
 """
 
 from __future__ import annotations

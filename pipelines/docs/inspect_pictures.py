@@ -16,11 +16,10 @@ from pathlib import Path
 import uvicorn
 from playwright.sync_api import sync_playwright
 
-from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.app import Inspection, listen, make_app
 from drakegrasp.page.attempts import Attempts
 from drakegrasp.page.predictions import Predictions
 from drakegrasp.page.scenes import Scenes
-from drakegrasp.page.serve import listen
 
 #: Chromium cannot use its sandbox when it runs as root; the CPU computes WebGL.
 OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

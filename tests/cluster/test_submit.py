@@ -31,9 +31,8 @@ import drakegrasp
 from drakegrasp import registry
 from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.certificates import made_or_given, make_certificates
 from drakegrasp.cluster.choice import cluster_of
-from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect
+from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, made_or_given, make_certificates
 from drakegrasp.cluster.jobqueue import Jobs
 from drakegrasp.cluster.kinds import Local
 from drakegrasp.errors import ConfigError, MachineError

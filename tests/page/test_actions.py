@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
-from drakegrasp.page.actions import DecisionFile, Step
+from drakegrasp.page.app import DecisionFile, Step
 
 A, B = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
 

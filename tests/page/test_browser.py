@@ -31,9 +31,8 @@ from drakegrasp.dataset.rejections import (
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.filters import Removal
 from drakegrasp.generation.scenes import make_scenes
-from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.app import Inspection, listen, make_app
 from drakegrasp.page.catalog import Snapshot, read_snapshot
-from drakegrasp.page.serve import listen
 
 playwright = pytest.importorskip("playwright.sync_api")
 Browser, Page = playwright.Browser, playwright.Page

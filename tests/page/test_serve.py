@@ -16,8 +16,7 @@ import pytest
 from helpers.commands import run
 from helpers.datasets import TRIALS
 
-from drakegrasp.page.app import ASSETS
-from drakegrasp.page.serve import LOOPBACK, listen
+from drakegrasp.page.app import ASSETS, LOOPBACK, listen
 
 #: The program, with Ctrl-C as at a terminal: a test that runs in the background inherits a shell's
 #: choice to ignore it.
