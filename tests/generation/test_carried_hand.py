@@ -15,8 +15,6 @@ from helpers.commands import error_line, run
 from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
-from helpers.pages import get
-from starlette.testclient import TestClient
 
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
@@ -26,7 +24,6 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.pictures.still_scene import StillScene, link_surfaces
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.shapes.catalog import builtin_sources
@@ -109,14 +106,6 @@ def test_an_export_has_the_links_of_the_hand(passed_on: Path, tmp_path: Path) ->
     assert any("left_tip" in name for name in scene.graph.nodes)
 
 
-def test_the_page_shows_the_hand(passed_on: Path, shapes: dict[str, bytes]) -> None:
-    with TestClient(make_app(Inspection(passed_on)), base_url="http://127.0.0.1") as client:
-        for number, surface in enumerate(shapes.values()):
-            assert client.get(f"/mesh/link-{number}.json").content == surface
-        page = get(client, "/grasp/0-0-0")
-    assert page.status_code == 200 and "the hand cannot be shown" not in page.text
-
-
 def test_it_names_the_hand_its_joints_and_its_licence(passed_on: Path) -> None:
     joints = load_hand(read_manifest(passed_on).config.hand_source).joint_names
     card = json.loads((passed_on / "DATACARD.json").read_text())
@@ -138,19 +127,6 @@ def test_it_names_the_hand_its_joints_and_its_licence(passed_on: Path) -> None:
 
 def hand_path(out: Path) -> Path:
     return out / "hand" / "tongs_hand.yaml"
-
-
-@pytest.mark.parametrize("hand", ["own", "barrett"])
-def test_a_folder_of_somebody_where_the_hand_goes_stays(tmp_path: Path, hand: str) -> None:
-    own = write_hand(tmp_path / "robot" / "hand")
-    before = {path: path.read_bytes() for path in own.parent.iterdir()}
-    result = run(
-        *("build", "--objects", "builtin", "--only", "6_can_1", "--out", tmp_path / "robot"),
-        *("--set", f"hand={own if hand == 'own' else hand}", "--workers", "1", "--quiet"),
-    )
-    assert result.exit_code != 0
-    assert "must not be there before a build" in error_line(result)
-    assert {path: path.read_bytes() for path in own.parent.iterdir()} == before
 
 
 def test_a_build_goes_on_with_the_same_hand_from_elsewhere(copy: Path, tmp_path: Path) -> None:

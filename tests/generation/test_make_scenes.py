@@ -60,14 +60,6 @@ def test_card_counts_them_as_long_as_they_are_of_the_dataset(scenes: Path, out: 
     assert "scenes" not in card_content(out)
 
 
-def test_nothing_else_of_the_dataset_changes(sound: Path, scenes: Path) -> None:
-    names = {path.name for path in scenes.parent.iterdir()} - {"build.lock"}
-    assert names == {path.name for path in sound.iterdir()} | {"scenes.hdf5"}
-    for path in sound.iterdir():
-        if path.is_file() and path.name not in CARD_FILES:
-            assert path.read_bytes() == (scenes.parent / path.name).read_bytes()
-
-
 def test_objects_are_turned_and_moved_and_cameras_differ_by_split(scenes: Path) -> None:
     with h5py.File(scenes) as file:
         X_TO = unpack_pose(file["scenes/X_TO"][:, 0])

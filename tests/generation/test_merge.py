@@ -79,10 +79,6 @@ def test_halves_by_objects_are_the_whole(sound: Path, tmp_path: Path) -> None:
     assert {path.stat().st_nlink for path in (tmp_path / "into/shards").rglob("*.h5")} == {2}
 
 
-def test_a_dataset_of_one_object_is_sound(sound: Path, tmp_path: Path) -> None:
-    assert check_dataset(half(sound, tmp_path / "one", slice(2, 3))) == []
-
-
 def test_where_files_cannot_be_linked_they_are_copied(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

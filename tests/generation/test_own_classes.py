@@ -135,16 +135,6 @@ def draw(box: ObjectModel, config: Config, count: int = 20) -> Candidates:
     return Drawing(box, X_TO, config).candidates(count)
 
 
-def test_the_sampler_of_the_page_looks_at_the_object(own: Path, box: ObjectModel) -> None:
-    config = load_config(overrides=["candidates.method=my_sampler.py:Ring"])
-    drawn = draw(box, config)
-    assert len(drawn) == 20 and np.isfinite(drawn.distance).all()
-    assert set(drawn.source) == {Source.OWN}
-    np.testing.assert_allclose(drawn.X_OG[:, :3, 2], -drawn.X_OG[:, :3, 3] / 0.107703296, atol=1e-8)
-    fewer = draw(box, config, 5)
-    np.testing.assert_array_equal(fewer.X_OG, drawn.X_OG[:5])
-
-
 def test_it_takes_turns_with_others_and_comes_to_workers(own: Path, box: ObjectModel) -> None:
     """A worker has the configuration alone: the file may be gone, or on another machine."""
     turns = ["candidates.method=[my_sampler.py:Ring, normals]", "filters.own=my_filter.py:Wide"]
@@ -183,15 +173,6 @@ def test_a_class_that_cannot_be_used_is_refused_in_one_line(
     with pytest.raises(ConfigError, match=message) as caught:
         build_config(load_config(overrides=["candidates.method=mine.py:Mine"]))
     assert "\n" not in str(caught.value)
-
-
-def test_a_missing_file_is_refused_with_its_key(own: Path) -> None:
-    for key in ("candidates.method", "filters.own"):
-        with pytest.raises(ConfigError, match=rf"^{key}: no\.py: must be a readable UTF-8 file"):
-            load_config(overrides=[f"{key}=no.py:Mine"])
-        for value in ("3", "no.py", "my_sampler.py:", "my_sampler:Ring"):
-            with pytest.raises(ConfigError, match=rf"^{key}: .*must "):
-                load_config(overrides=[f"{key}={value}"])
 
 
 @pytest.mark.parametrize("name", WRONG_POSES)
@@ -248,22 +229,6 @@ def test_what_is_no_shape_of_the_hand_is_refused_in_one_line(
     with pytest.raises(ConfigError, match=message) as caught:
         draw(box, sampler(f"yield np.eye(4), {first}; yield np.eye(4), {shape}", hand))
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("metres", [(0.0, 0.0, 100.0), (0.0, 0.0, 1.05), (80.0, -60.0, 0.0)])
-def test_a_sampler_far_away_is_told_how_far(
-    own: Path, box: ObjectModel, metres: tuple[float, float, float]
-) -> None:
-    pose = "X = np.eye(4); X[:3, 3] = {}; yield X"
-    wrong = r"^mine\.py:Mine: poses must be X_OG in metres, within 1 m .*nearest {:.3g} m from box$"
-    distance = np.linalg.norm(np.maximum(np.abs(metres) - box.half_extents, 0.0))
-    with pytest.raises(ConfigError, match=wrong.format(distance)):
-        draw(box, sampler(pose.format(metres)))
-    # One that faces the object is moved to its stand-offs, and one that is near may miss.
-    facing = f"X = np.diag([1.0, -1, -1, 1]); X[2, 3] = {metres[2] + 0.1}; yield X"
-    assert np.isfinite(draw(box, sampler(facing)).distance).all()
-    near = draw(box, sampler(pose.format((0.0, 0.0, 0.5))))
-    assert len(near) == 1 and np.isnan(near.distance).all()
 
 
 @pytest.mark.nightly

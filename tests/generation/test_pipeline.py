@@ -22,9 +22,9 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
+from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.dataset.statistics import count_funnel
-from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
+from drakegrasp.errors import ConfigError, DataError, MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.generation.prepare import prepare_one
@@ -120,19 +120,6 @@ def test_second_build_simulates_nothing(out: Path, again: Again) -> None:
     assert {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")} == before
 
 
-def _flip_byte(shard: Path) -> None:
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    shard.write_bytes(bytes(content))
-
-
-def test_changed_filter_needs_no_simulation(out: Path, small_config: Config, again: Again) -> None:
-    config = override_config(small_config, ["filters.min_depth_variance=1"])
-    report = again(out, _nothing_runs, config=config)
-    assert report.assembly.removed.get(Removal.KEPT, 0) == 0
-    assert report.assembly.grasps > 0
-
-
 def test_changed_mesh_is_done_again_and_the_others_are_not(
     meshes: Path, out: Path, again: Again
 ) -> None:
@@ -183,19 +170,6 @@ def test_changed_class_is_in_the_files_without_a_simulation(
     (meshes / "objects.yaml").write_text(said)
     second = again(out, _nothing_runs, meshes=meshes)
     assert second.assembled and read_manifest(out).objects[1].group == "box"
-
-
-def test_shard_that_is_not_the_assembled_one_is_assembled(out: Path, again: Again) -> None:
-    """As after a build that simulated it again, and whose client died before it assembled."""
-    path = sorted(out.glob("shards/*/*.h5"))[0]
-    shard = read_shard(path)
-    (failed,) = np.nonzero(shard.trials["outcome"] != Outcome.SUCCESS)
-    shard.trials["outcome"][failed[0]] = Outcome.CRASHED
-    write_shard(out, shard)
-    report = again(out, _nothing_runs)
-    assert (report.simulated, report.assembled) == (0, True)
-    with h5py.File(out / "trials.hdf5") as file:
-        assert Outcome.CRASHED in file["trials/outcome"][:]
 
 
 def test_build_keeps_what_an_inspection_rejected(meshes: Path, out: Path, again: Again) -> None:
@@ -287,17 +261,6 @@ def test_replay_says_what_differs(out: Path) -> None:
     assert again.differences["spread"] == again.differences["outcome"] == pytest.approx(1.0)
     with pytest.raises(DataError, match="trial must be 0 to 143, got 144"):
         replay_trial(out, 144)
-
-
-def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> None:
-    out = tmp_path / "out"
-    with pytest.raises(ConfigError, match="workers must be at least 1, got 0"):
-        build_dataset(small_meshes, out, workers=0)
-    with pytest.raises(ConfigError, match="must not be given with a scheduler"):
-        build_dataset(small_meshes, out, workers=1, scheduler="tcp://127.0.0.1:1")
-    with pytest.raises(MeshError, match="mesh"):
-        build_dataset(tmp_path / "nowhere", out)
-    assert not out.exists()
 
 
 @pytest.mark.cluster

@@ -20,10 +20,9 @@ from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.schema import NO_PRESHAPE
-from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
-from drakegrasp.frames import make_pose, unpack_pose
+from drakegrasp.frames import make_pose
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.generation.request import build_config
@@ -35,8 +34,6 @@ from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.runtime.files import seal
-from drakegrasp.scoring.verdict import verdict_of
 from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.attempts import (
     Attempts,
@@ -48,8 +45,6 @@ from drakegrasp.simulation.placement import place_object
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.simulation.trial import run_attempt
 from drakegrasp.verification.placing import place_on_dataset, place_on_object
-from drakegrasp.verification.result_files import write_results
-from drakegrasp.verification.verify import verify_placed
 
 pytestmark = pytest.mark.sim
 
@@ -134,26 +129,6 @@ def test_plan_keeps_what_the_file_said(dataset, table):
     kept = load_prepared(dataset, NAME, config).candidates.postures
     np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
     assert kept.preshape.tolist() == [""] * 4
-
-
-def test_plan_whose_texts_are_nested_too_deeply_is_refused_in_a_line(dataset, table, tmp_path):
-    shutil.copytree(dataset / "objects", tmp_path / "objects")
-    path = tmp_path / f"objects/{NAME}.plan.h5"
-    with h5py.File(path, "r+") as file:
-        del file["preshape"]
-        file["preshape"] = np.frombuffer(b"[" * 100_000, dtype=np.uint8)
-    seal(path)
-    with pytest.raises(DataError, match="must hold postures, got none: values nested too deeply"):
-        load_prepared(tmp_path, NAME, build_config(CONFIG, table))
-
-
-def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path):
-    shutil.copy(dataset / "trials.hdf5", tmp_path)
-    with h5py.File(tmp_path / "trials.hdf5", "r+") as file:
-        del file["trials/own_motors"], file["trials/posture_row"]
-    older = Trials(tmp_path / "trials.hdf5")
-    assert not older["own_motors"].any()
-    assert np.isnan(older["posture_row"]).all()
 
 
 @pytest.mark.nightly
@@ -259,35 +234,6 @@ def test_a_posture_of_a_preshape_is_the_attempt_that_it_was(of_preshapes):
     assert not trials["own_motors"][0]
 
 
-def test_verdict_on_a_posture_of_a_preshape_has_a_place_for_every_finger(of_preshapes, tmp_path):
-    out, q = of_preshapes
-    config = read_manifest(out).config
-    hand = load_hand(config.hand_source)
-    row = Trials(out)[[0]]
-    table = make_attempts(
-        *(hand, [NAME] * 2, [unpack_pose(row["X_OG"][0])] * 2, [q] * 2),
-        preshape=["pair", "fist"],
-    )
-    held, none = map(verify_placed, place_on_dataset(table, out))
-    assert held.held
-    assert none.outcome is Outcome.INVALID
-    assert none.reason.startswith("preshape must be one of all, pair for the hand")
-    assert held.closed.touching.tolist() == [True, False, True]
-    assert (held.closed.f_Q_O[1] == 0.0).all()
-    np.testing.assert_allclose(held.closed.p_OQ, row["closed_p_OQ"][0], atol=1e-3)
-    assert np.isnan(held.closing_start).tolist() == [False, True, False]
-    write_results([held, none], tmp_path / "v.h5", config)
-    assert not verdict_of(held).contacts
-
-
-def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
-    out, _ = of_preshapes
-    assert check_dataset(out) == []
-    assert replay_trial(out, 0).same
-    counts = [(each["preshape"], each["held"]) for each in counts_as_dict(out)["preshapes"]]
-    assert counts == [("all", 0), ("pair", 2), (NO_NAME, 1)]
-
-
 def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_preshapes, tmp_path):
     out = Path(shutil.copytree(of_preshapes[0], tmp_path / "out"))
     make_scenes(out, overrides=["scenes.views=1", "scenes.width=64", "scenes.height=48"])
@@ -299,11 +245,6 @@ def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_presh
     for row, at in ((0, 0.0), (2, BEGUN)):
         start = joint_positions(pair, 0.0, np.full(2, at))
         np.testing.assert_allclose(q_open[row], [start[name] for name in order], atol=1e-6)
-
-
-def test_hash_of_postures_is_of_their_preshapes_too():
-    plain = make_attempts(HAND, ["cup"], [np.eye(4)], np.zeros((1, 8)), resting=[0])
-    assert replace(plain, preshape=("pair",)).digest() != plain.digest()
 
 
 def test_settings_that_name_other_postures_are_refused(table):

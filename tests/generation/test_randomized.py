@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from helpers.assertions import assert_same_dataset
 from helpers.builds import build
 from helpers.meshes import SMALL
 
 from drakegrasp.api.verifying import verify_grasps
 from drakegrasp.config import Config
-from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
@@ -59,10 +56,6 @@ def trials(out: Path) -> dict[str, np.ndarray]:
         return {name: values[:][rows] for name, values in file["trials"].items()}
 
 
-def test_check_finds_nothing(randomized: Path) -> None:
-    assert [str(v) for v in check_dataset(randomized)] == []
-
-
 def test_attempts_are_those_of_a_build_without_draws(randomized: Path, small_dataset: Path) -> None:
     drawn = trials(randomized)
     usual = {k: v[: len(drawn["outcome"])] for k, v in trials(small_dataset).items()}
@@ -77,29 +70,12 @@ def test_attempts_are_those_of_a_build_without_draws(randomized: Path, small_dat
     assert np.all(drawn["slip"][lifted] != usual["slip"][lifted])
 
 
-@pytest.mark.nightly
-def test_order_of_work_changes_nothing(
-    sources: list[MeshSource], config: Config, randomized: Path, tmp_path: Path
-) -> None:
-    def backwards(function: Callable, items: Iterable) -> Iterator:
-        return (function(item) for item in reversed(list(items)))
-
-    build(sources, tmp_path / "out", config, backwards, show=False)
-    assert_same_dataset(randomized, tmp_path / "out")
-
-
 @pytest.mark.parametrize("outcome", [Outcome.SUCCESS, Outcome.MISSING_FINGERTIP])
 def test_replay_gives_the_same_bits(randomized: Path, tmp_path: Path, outcome: Outcome) -> None:
     rows = np.flatnonzero(trials(randomized)["outcome"] == outcome)
     replay = replay_trial(randomized, int(rows[0]))
     assert replay.same, replay.differences
     assert record_trial(randomized, int(rows[0]), tmp_path / "trial.html") is outcome
-
-
-def test_images_differ_in_light_and_colour(randomized: Path) -> None:
-    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
-    means = np.array([s.image[:3, s.mask == 1].mean(axis=1) for s in data])
-    assert np.ptp(means, axis=0).min() > 0.1
 
 
 def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) -> None:

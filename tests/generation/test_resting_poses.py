@@ -11,12 +11,11 @@ import h5py
 import numpy as np
 import pytest
 from cross_check import cross_check
-from helpers.assertions import assert_same_arrays, assert_same_dataset
+from helpers.assertions import assert_same_arrays
 from helpers.builds import build
 from helpers.meshes import write_fixed
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.filters import Removal
@@ -71,10 +70,6 @@ def samples(out: Path) -> np.ndarray:
     with h5py.File(out / "trials.hdf5") as file:
         removal, ids = file["successes/removal"][:], file["successes/trial_id"][:]
     return np.asarray(ids[removal == Removal.KEPT])
-
-
-def test_check_finds_nothing(dataset: Path) -> None:
-    assert [str(v) for v in check_dataset(dataset)] == []
 
 
 def test_samplers_and_resting_poses_take_turns(dataset: Path) -> None:
@@ -167,10 +162,3 @@ def test_target_is_met_and_extended(
     for name, values in trials(dataset).items():
         np.testing.assert_array_equal(columns[name], values)
     assert before <= {row.tobytes() for row in columns["X_OG"]}
-
-
-def test_assembling_again_gives_the_same(dataset: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(dataset, copy)
-    assemble(copy)
-    assert_same_dataset(copy, dataset)

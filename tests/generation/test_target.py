@@ -135,18 +135,6 @@ def test_object_is_given_up_after_its_patience_and_stays_so() -> None:
     assert run(make_target(taken, samples_per_object=5)) == taken
 
 
-def test_larger_target_takes_nothing_out() -> None:
-    first = run(make_target(samples=12))
-    more = run(make_target(first, samples=30))
-    assert sum(samples(more).values()) == 30
-    assert all(more[name] >= palms for name, palms in first.items())
-
-
-def test_smaller_target_keeps_what_is_there() -> None:
-    first = run(make_target(samples=30))
-    assert run(make_target(first, samples=12)) == first
-
-
 @pytest.mark.parametrize("workers", [1, 3])
 def test_unit_that_grows_is_run_again(workers: int) -> None:
     """A dataset of 10 palm poses ends within a unit of four: its last two are of no use."""
@@ -190,19 +178,6 @@ def test_palm_poses_with_several_hits_are_counted_whole(wanted: int) -> None:
     found = [sum(hit < palms for hit in EVERY["triple"]) for palms in target.taken().values()]
     assert wanted <= sum(found) <= wanted + 2
     assert max(found) <= 3
-
-
-def test_new_object_fills_up_while_others_stay() -> None:
-    old = {"rich": 30, "poor": 0}
-    found = samples(run(make_target(old, samples=35)))
-    assert found == {"rich": 30, "poor": 5}
-
-
-def test_what_was_there_before_is_nobodys_larger_share() -> None:
-    """A smaller target, or new objects: the others are not exhausted."""
-    target = make_target({"rich": 30, "poor": 0}, samples=8)
-    assert run(target) == {"rich": 30, "poor": 0}
-    assert target.warnings() == []
 
 
 def test_target_that_cannot_be_met_is_told() -> None:

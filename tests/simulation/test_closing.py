@@ -5,15 +5,12 @@ The jaws are 80 mm apart and slide by up to 40 mm each along Gy; their tips are 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
-from helpers.hands import slider_fingers, write_linked, write_slider
+from helpers.hands import slider_fingers, write_slider
 
-from drakegrasp.errors import HandError
-from drakegrasp.frames import Array, invert_pose, make_pose
+from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.cloud import Solid
 from drakegrasp.mesh.distance_field import make_distance_field
@@ -132,35 +129,3 @@ def test_a_hand_may_begin_to_close_from_other_positions(jaws: Hand) -> None:
     np.testing.assert_allclose(found["closed"][0], 0.5, atol=BLUR / JAW)
     assert found["free"].tolist() == found["robust"].tolist() == [True, False]
     np.testing.assert_allclose(found["clearance"][1], -0.005, atol=BLUR)
-
-
-def test_arm_is_the_horizontal_distance_from_the_middle(jaws: Hand) -> None:
-    """Jaws at the end of a beam, the middle of whose solid is stated to be elsewhere."""
-    beam = trimesh.creation.box([0.12, 2 * HALF, 0.006]).apply_translation([0.0, 0.0, 0.06])
-    stated = Solid(field=solid(beam).field, middle=np.full(3, 0.01))
-    at_end = close_on(stated, jaws, 0.0, down(x=0.045, z=0.13)[None])
-    # The contacts are within the 20 mm of the jaws, and on the 6 mm of the beam.
-    assert abs(at_end["arm"][0] - np.hypot(0.035, 0.01)) < 0.010 + SPACING
-    np.testing.assert_allclose(at_end["above"], 0.05, atol=SPACING)
-    np.testing.assert_allclose(at_end["heights"], 0.06, atol=SPACING)
-
-
-def test_features_do_not_depend_on_the_frame_of_the_solid(jaws: Hand) -> None:
-    """An object that lies on its side: its field is in {O}, or it was moved to {T} before."""
-    X_TO = np.array([[0.0, 0, 1, 0.1], [1, 0, 0, -0.2], [0, 1, 0, 0.02], [0, 0, 0, 1]])
-    mesh = trimesh.creation.box([0.06, 2 * HALF, 0.08])
-    mesh = trimesh.util.concatenate([mesh, trimesh.creation.icosphere(3, 0.035)])
-    palms = [down(x=0.1, y=-0.2, z=0.12), down(x=0.115, y=-0.19, z=0.12), down(x=0.1, z=0.12)]
-    X_TG = np.stack(palms)
-    in_O = close_on(solid(mesh), jaws, 0.0, invert_pose(X_TO) @ X_TG, X_TS=X_TO)
-    in_T = close_on(solid(mesh.copy().apply_transform(X_TO)), jaws, 0.0, X_TG)
-    assert in_T["touch"].tolist() == [[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]
-    assert in_O.keys() == in_T.keys()
-    for name, values in in_T.items():
-        np.testing.assert_allclose(in_O[name], values, atol=5e-3, err_msg=name)
-
-
-def test_a_hand_whose_fingers_share_a_link_is_refused(tmp_path: Path) -> None:
-    hand = load_hand(write_linked(tmp_path))
-    with pytest.raises(HandError, match="must be one whose fingers share no link, got pincer"):
-        close_on(solid(box()), hand, 0.0, down()[None])

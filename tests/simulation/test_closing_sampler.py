@@ -6,22 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import trimesh
 from helpers.builds import build
 from helpers.hands import write_linked
-from helpers.meshes import write
 from helpers.objects import model_of
 
 from drakegrasp.config import Config
-from drakegrasp.distinct import NEAR_SHIFT, NEAR_TURN, approach_cells
+from drakegrasp.distinct import NEAR_SHIFT, NEAR_TURN
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.model import ObjectModel, prepare_object
-from drakegrasp.objects.sources import find_meshes
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.shapes import kitchen
 from drakegrasp.simulation.attempt import Source
@@ -61,12 +58,6 @@ def draw(model: ObjectModel, most: int, config: Config | None = None) -> Candida
     return Drawing(model, standing(model), config or closing()).candidates(most)
 
 
-def down(model: ObjectModel, drawn: Candidates) -> npt.NDArray[np.float64]:
-    """Return the angles (n,) of the approaches below the horizontal [degree]."""
-    z_T = (standing(model) @ drawn.X_OG)[:, :3, 2]
-    return np.rad2deg(np.arcsin(np.clip(-z_T[:, 2], -1.0, 1.0)))
-
-
 def assert_equal(one: Candidates, two: Candidates) -> None:
     for name in ("X_OG", "distance", "spread", "preshape_index", "resting", "source"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
@@ -80,25 +71,6 @@ def test_first_palms_are_the_same_for_every_number(model: Callable[[str], Object
         assert len(few) == most
         np.testing.assert_array_equal(few.X_OG, many.X_OG[:most])
         np.testing.assert_array_equal(few.spread, many.spread[:most])
-
-
-def test_an_object_has_its_palms_wherever_its_mesh_lies(tmp_path: Path) -> None:
-    """Alone in a directory, or after others that are prepared and sampled before."""
-    alone, among = tmp_path / "alone", tmp_path / "among"
-    names = {alone: ["2_tall_a"], among: ["1_ball_a", "2_tall_a"]}
-    drawn = {}
-    for folder, inside in names.items():
-        folder.mkdir()
-        for name in inside:
-            write(folder / f"{name}.obj", meshes()[name.split("_")[1]])
-        for source in find_meshes(folder):
-            drawn[folder] = draw(prepare_object(source), 60)
-    assert_equal(drawn[alone], drawn[among])
-    assert_equal(drawn[alone], draw(prepare_object(find_meshes(alone)[0]), 60))
-    # Draws are of the seed and the name.
-    (source,) = find_meshes(alone)
-    other = draw(prepare_object(source), 60, closing(seed=1))
-    assert (other.X_OG[30:] != drawn[alone].X_OG[30:]).any()
 
 
 def test_rounding_of_the_resting_pose_changes_no_bit(model: Callable[[str], ObjectModel]) -> None:
@@ -137,16 +109,6 @@ def test_a_palm_is_tried_once_as_it_is(model: Callable[[str], ObjectModel], hand
         assert (-1 if attempt.preshape is None else attempt.preshape) == drawn.preshape_index[i]
 
 
-def test_sides_take_turns(model: Callable[[str], ObjectModel]) -> None:
-    """Around a tall box, of any first palms at most 60 % come from above."""
-    found = down(model("tall"), draw(model("tall"), 60))
-    sides = np.array([np.count_nonzero(found < 30.0), np.count_nonzero(found >= 60.0)])
-    beside, above = sides
-    assert beside >= 15 and above >= 6
-    share = np.cumsum(found >= 60.0) / np.arange(1, 61)
-    assert share[4:].max() <= 0.6
-
-
 def test_first_palms_are_distinct(model: Callable[[str], ObjectModel]) -> None:
     X = draw(model("tall"), 24).X_OG
     shift = np.linalg.norm(X[:, None, :3, 3] - X[None, :, :3, 3], axis=2)
@@ -154,12 +116,6 @@ def test_first_palms_are_distinct(model: Callable[[str], ObjectModel]) -> None:
     turn = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
     near = (shift < NEAR_SHIFT) & (turn < NEAR_TURN)
     assert near.sum() == len(X)
-
-
-def test_directions_take_turns(model: Callable[[str], ObjectModel]) -> None:
-    """Around a tall box many directions are as good, and none comes again before all others."""
-    cells = approach_cells(draw(model("tall"), 10).X_OG)
-    assert len(set(cells.tolist())) == 10
 
 
 @pytest.mark.parametrize("name", ["ball", "mug"])

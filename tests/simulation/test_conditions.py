@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from drakegrasp.config import Config
 from drakegrasp.frames import rotation_angle
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.conditions import WORDS, Conditions, draw_conditions, usual_conditions
+from drakegrasp.simulation.conditions import Conditions, draw_conditions, usual_conditions
 
 COUNT = 400
 #: The preset that draws everything.
@@ -98,28 +97,6 @@ def test_ranges_are_kept_and_filled_evenly(
     assert share.std() == pytest.approx(1.0 / np.sqrt(12.0), abs=0.03)
 
 
-def test_no_two_quantities_share_a_word() -> None:
-    places = [i for words in WORDS.values() for i in range(words.start, words.stop)]
-    assert places == list(range(len(places)))
-
-
-def test_half_a_random_colour_leaves_half_of_the_own_one(cube: ObjectModel) -> None:
-    own = usual_conditions(cube, load_config().physics).appearance.table_colour
-    colours = column(draws(cube, config_with(*KEYS)), "table_colour")
-    assert np.all((colours >= own / 2.0) & (colours <= own / 2.0 + 0.5))
-
-
-def test_light_is_uniform_over_its_cap(cube: ObjectModel) -> None:
-    usual = usual_conditions(cube, load_config().physics).appearance.light_direction
-    ways = column(draws(cube, config_with(*KEYS)), "light_direction")
-    assert np.allclose(np.linalg.norm(ways, axis=1), 1.0, atol=1e-15)
-    cosine, least = ways @ usual, np.cos(np.deg2rad(40.0))
-    assert cosine.min() >= least - 1e-12
-    assert ((cosine - least) / (1.0 - least)).mean() == pytest.approx(0.5, abs=0.05)
-    # From all sides.
-    assert np.linalg.norm((ways - cosine[:, None] * usual).mean(axis=0)) < 0.05
-
-
 def test_camera_is_shifted_and_turned_about_all_axes_at_most_so_far(cube: ObjectModel) -> None:
     poses = np.array([one.X_C0C for one in draws(cube, config_with(*KEYS))])
     assert np.abs(poses[:, :3, 3]).max() <= 0.01
@@ -130,21 +107,3 @@ def test_camera_is_shifted_and_turned_about_all_axes_at_most_so_far(cube: Object
     skew = np.abs([poses[:, 2, 1], poses[:, 0, 2], poses[:, 1, 0]])
     assert np.all(skew.max(axis=1) > np.sin(np.deg2rad(4.8)))
     assert np.abs(np.swapaxes(poses, 1, 2)[:, :3, :3] @ poses[:, :3, :3] - np.eye(3)).max() < 1e-15
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        lambda model, config: draw_conditions(model, config, 4, 1),
-        lambda model, config: draw_conditions(model, config, 3, 2),
-        lambda model, config: draw_conditions(model, load_config(PRESET, seed=1), 3, 1),
-    ],
-    ids=["candidate", "stand-off", "seed"],
-)
-def test_another_attempt_has_other_draws(
-    cube: ObjectModel, other: Callable[[ObjectModel, Config], Conditions]
-) -> None:
-    config = load_config(PRESET)
-    first = draw_conditions(cube, config, 3, 1).values()
-    assert equal(first, other(cube, config).values()) == []
-    assert equal(first, draw_conditions(cube, config, 3, 1).values()) == list(first)

@@ -66,17 +66,6 @@ def test_contact_off_the_pad_is_one_of_another_link(closed):
     assert judge_closed(contacts.touching, contacts.other_links, False).item()
 
 
-def test_patch_over_the_border_is_the_fingertips(closed):
-    """As a whole, where most of it is on the pad or its band: nothing of it changes."""
-    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
-    x = _contact_in_link(closed, whole)
-    part = with_pads(closed, ((1.0, 0.0, 0.0, x + 0.5 * PAD_BAND),), EVERYWHERE, EVERYWHERE)
-    assert part.other_links == 0
-    assert np.array_equal(part.f_Q_O, whole.f_Q_O)
-    assert np.array_equal(part.p_OQ, whole.p_OQ)
-    assert np.array_equal(part.area, whole.area)
-
-
 @pytest.mark.parametrize("scale", [1.0, 2.0])
 def test_patch_mostly_beside_the_pad_is_split(closed, scale):
     """The pad's part is a fingertip's contact, and the rest is one of another link."""
@@ -214,39 +203,3 @@ def test_point_contacts_are_counted(closed: Scene) -> None:
         reader.add_point_pair(pair)
         found = reader.contacts()
         assert (found.point_contacts, found.hand_on_table) == (count, on_table)
-
-
-def test_rest_of_a_split_patch_counts_by_its_own_force(closed: Scene) -> None:
-    """It carries what the pad does not."""
-    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
-    x = _contact_in_link(closed, whole)
-    beyond = (1.0, 0.0, 0.0, x + PAD_BAND + 1e-3)
-    part = with_pads(closed, (beyond,), EVERYWHERE, EVERYWHERE)
-    rest = float(np.linalg.norm(whole.f_Q_O[0] - part.f_Q_O[0]))
-    for factor, count in ((0.99, 1), (1.01, 0)):
-        physics = closed.physics.model_copy(update={"contact_force": factor * rest})
-        strict = replace(closed, physics=physics)
-        assert with_pads(strict, (beyond,), EVERYWHERE, EVERYWHERE).other_links == count
-
-
-def test_palm_on_the_object_is_another_link(scene: Scene, cube: ObjectModel) -> None:
-    """Open fingers, and the pad of the palm less than half of its thickness in the top."""
-    X_WO = X_WT @ standing(cube)
-    reset_attempt(scene, X_WO, X_WO @ from_above(cube, 0.001).X_OG, spread=0.0)
-    found = read_contacts(scene)
-    assert not found.touching.any()
-    assert found.other_links == 1
-    palm = scene.plant.GetBodyByName(scene.hand.palm_link)
-    assert bodies_on_object(scene) == {palm.index()}
-
-    # It counts by what it presses with, as Drake adds it up.
-    port = scene.plant.get_contact_results_output_port()
-    results = port.Eval(scene.plant.GetMyContextFromRoot(scene.simulator.get_context()))
-    forces = [
-        np.linalg.norm(results.hydroelastic_contact_info(i).F_Ac_W().translational())
-        for i in range(results.num_hydroelastic_contacts())
-    ]
-    for more, count in ((-0.5, 1), (0.5, 0)):
-        limit = max(forces) + more
-        strict = replace(scene, physics=scene.physics.model_copy(update={"contact_force": limit}))
-        assert read_contacts(strict).other_links == count

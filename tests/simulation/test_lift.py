@@ -178,21 +178,6 @@ def test_verdict_at_the_end_of_a_whole_lift_goes_first(sliding):
     assert same_bits(sliding("lift.check_period=9", LOST_SAMPLE), whole)
 
 
-def test_certain_verdict_goes_before_a_lost_sample(cube, hand):
-    """Between two checks the object slides from 29 to 60 mm, out of the hand."""
-    slippery = load_config(overrides=["physics.friction_hand=0.05"])
-    scene = build_scene(cube, slippery.physics, hand)
-    records = {}
-    for limit in (0.02, 0.04):
-        rules = override_config(slippery, [LOST_SAMPLE, f"lift.stop_slip={limit}"])
-        records[limit] = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), rules)
-    assert records[0.02].outcome is Outcome.MOVED
-    assert records[0.02].lift.slip < 0.04 < records[0.04].lift.slip
-    whole = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slippery)
-    assert whole.outcome is Outcome.DROPPED
-    assert same_bits(records[0.04], whole)
-
-
 def test_slip_before_the_wrist_moves_is_told_apart(scene, cube, config):
     """It creeps where fingers can be pushed open: a little while the wrist waits."""
     torque = override_config(config, ["lift.drive=torque", "lift.release_time=0.5"])
@@ -262,25 +247,6 @@ def test_monitor_judges_what_moved_since_the_last_look(
     monkeypatch.setattr(lifting, "_has_lost_tip", lambda _: "off" in touching)
     assert monitor.update(scene, 0.1, 0.01) is certain
     assert monitor.at_rest is at_rest
-
-
-def test_lift_is_looked_at_in_even_periods_just_before_a_step(scene, cube, config, monkeypatch):
-    """Rounding moves no step across a look, and a look knows how long ago the last one was."""
-    update, elapsed, times = lifting._Monitor.update, [], []
-
-    def record(monitor, current, seconds, stop_speed):
-        elapsed.append(seconds)
-        times.append(current.time)
-        return update(monitor, current, seconds, stop_speed)
-
-    monkeypatch.setattr(lifting._Monitor, "update", record)
-    record_of = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
-    assert record_of.outcome is Outcome.SUCCESS
-    assert len(times) > 10
-    np.testing.assert_allclose(np.diff(times[:-1]), elapsed[1:-1], atol=1e-6)
-    steps = np.array(times[:-1]) / config.physics.time_step
-    before = np.ceil(steps) - steps
-    assert np.all((before > 1e-7) & (before < 0.01))
 
 
 @pytest.mark.parametrize(("away", "lost"), [(0.0, False), (2.5e-3, False), (4e-3, True)])

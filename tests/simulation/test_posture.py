@@ -14,7 +14,7 @@ from helpers.objects import STANDOFF, from_above, standing
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.kinematics import coordinate_limits, joint_positions
+from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempts import make_posture
@@ -31,7 +31,6 @@ from drakegrasp.simulation.posture import (
 from drakegrasp.simulation.scene import (
     closing_angles,
     command_joints,
-    hand_joint_names,
     joint_limits,
     reset_attempt,
 )
@@ -55,10 +54,6 @@ def test_pose_in_any_frame_is_held_in_the_object(frame):
     camera = X_TC if frame == "camera" else None
     made = make_posture(hand, X_FG, np.zeros(8), frame=frame, X_TO=X_TO, X_TC=camera)
     np.testing.assert_allclose(made.X_OG, X, atol=1e-12)
-
-
-def test_exact_pose_keeps_its_bits():
-    np.testing.assert_array_equal(make_posture(load_hand(), X, np.zeros(8)).X_OG, X)
 
 
 def test_joints_in_another_order_are_told_by_their_names():
@@ -99,12 +94,6 @@ def test_posture_of_the_couplings_is_an_attempt_of_spread_and_closing():
     np.testing.assert_allclose(start.closing, [1.0 - OPENED, 0.0, 0.9 - OPENED])
 
 
-def test_pregrasp_of_the_open_hand_starts_there():
-    hand = load_hand()
-    there = posture_of(hand, 0.2, [0.0, 0.0, 0.0]).q_grasp
-    assert start_of(posture_of(hand, 0.2, [1.0] * 3, q_pregrasp=there), hand).closing is None
-
-
 @pytest.mark.parametrize(("off_deg", "own"), [(0.9, False), (1.1, True)])
 @pytest.mark.parametrize("joint", ["finger1_distal_joint", "finger2_spread_joint"])
 @pytest.mark.parametrize("stage", ["q_grasp", "q_pregrasp", "q_squeeze"])
@@ -130,13 +119,6 @@ def test_joint_that_no_motor_moves_is_locked_where_the_grasp_has_it(joint, own, 
     start = start_of(Posture(X, grasp, pregrasp), hand)
     assert start.own_motors == own
     assert start.path[0, at] == grasp[at]
-
-
-def test_spread_beyond_its_limit_is_brought_within():
-    hand = load_hand()
-    start = start_of(posture_of(hand, 4.0, [1.0, 1.0, 1.0]), hand)
-    assert start.path is None
-    assert start.spread == coordinate_limits(hand)[0, 1]
 
 
 def test_joints_beyond_their_limits_are_brought_within():
@@ -171,11 +153,6 @@ def uncoupled(given, scene) -> Posture:
         q[order.index(finger.coupled[0].joint)] += 0.1
         q[order.index(finger.closing_joint)] -= 0.04
     return Posture(given.X_OG, q, q - (q - given.q_pregrasp) * 0.3)
-
-
-@pytest.mark.sim
-def test_plant_has_the_joints_in_the_order_of_postures(scene):
-    assert tuple(hand_joint_names(scene)) == joint_order(scene.hand)
 
 
 @pytest.mark.sim
@@ -227,17 +204,6 @@ def test_worm_of_a_joint_holds_against_the_way_of_its_motor(scene, cube, given, 
 
 
 @pytest.mark.sim
-def test_hand_that_stays_short_of_the_object_touches_nothing(scene, cube, config, given):
-    q = given.q_grasp.copy()
-    q[joint_order(scene.hand).index("finger1_distal_joint")] += 0.1
-    short = given.q_pregrasp + 0.5 * (q - given.q_pregrasp)
-    start = start_of(Posture(given.X_OG, short, given.q_pregrasp, short), scene.hand)
-    record = run_attempt(scene, standing(cube), start, config)
-    assert record.outcome is Outcome.MISSING_FINGERTIP
-    np.testing.assert_allclose(record.closed.q, start.path[2], atol=0.01)
-
-
-@pytest.mark.sim
 def test_public_trial_closes_the_fingers_of_the_preshape(cube, given, tmp_path):
     path = write_with_preshapes(tmp_path, all="F1 F2 F3", pair="F1 F3")
     config = load_config(overrides=[f"hand={path}"])
@@ -267,16 +233,6 @@ def test_a_palm_pose_alone_closes_from_the_open_hand(tmp_path):
     )
 
 
-@pytest.mark.sim
-def test_trial_of_a_palm_pose_alone_is_that_of_the_open_hand(cube, config, given):
-    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
-    alone = run_trial(placed, Posture(given.X_OG))
-    open_hand = np.zeros_like(given.q_grasp)
-    whole = run_trial(placed, Posture(given.X_OG, open_hand, open_hand))
-    assert alone.outcome is whole.outcome is Outcome.SUCCESS
-    np.testing.assert_array_equal(alone.closed.q, whole.closed.q)
-
-
 def test_a_preshape_that_the_hand_lacks_is_refused(tmp_path):
     shaped = load_hand(write_with_preshapes(tmp_path, pair="F1 F3"))
     q = np.zeros(8)
@@ -286,10 +242,3 @@ def test_a_preshape_that_the_hand_lacks_is_refused(tmp_path):
     assert "preshape must be one of pair for the hand shaped, got 'all'" in refused(
         start_of, Posture(X, q, preshape="all"), shaped
     )
-
-
-def test_public_trial_refuses_what_is_no_posture(cube, config):
-    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
-    assert "posture must be a Posture" in refused(run_trial, placed, np.zeros(18))
-    assert "placed must be of place_object" in refused(run_trial, cube, Posture(X, np.zeros(8)))
-    assert "q_grasp must be 8 finite" in refused(run_trial, placed, Posture(X, np.zeros(5)))

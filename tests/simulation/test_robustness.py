@@ -70,26 +70,6 @@ def test_repeats_are_lifted_to_their_end_with_the_trials_step(cube, config, monk
     assert seen.physics == [config.physics] * 2
 
 
-def test_own_friction_of_the_object_is_disturbed(cube, config, monkeypatch):
-    """The repeats are those of a configuration with this friction."""
-    seen, attempt = Seen(monkeypatch), from_above(cube, STANDOFF)
-    other = override_config(config, ["physics.friction_hand=0.5", "physics.friction_table=0.5"])
-    repeat_disturbed(replace(cube, friction=0.5), standing(cube), attempt, config)
-    repeat_disturbed(cube, standing(cube), attempt, other)
-    own, configured = np.array_split([a.conditions.materials for a in seen.attempts], 2)
-    assert own.tolist() == configured.tolist()
-
-
-def test_repeats_without_a_verdict_do_not_count(cube, config, monkeypatch):
-    """And after a failure of Drake there is a new scene."""
-    seen = Seen(monkeypatch, Outcome.SUCCESS, Outcome.TIMEOUT, Outcome.SOLVER_ERROR)
-    more = override_config(config, ["robustness.repeats=4"])
-    records = repeat_disturbed(cube, standing(cube), from_above(cube, STANDOFF), more)
-    assert [record.outcome for record in records] == [Outcome.SUCCESS] * 2
-    assert len(seen.attempts) == len(seen.physics) == 4
-    assert len(seen.forgotten) == 1
-
-
 def test_draw_is_the_attempts_own_and_of_its_probability(cube):
     attempts = [replace(from_above(cube, STANDOFF), seed=seed) for seed in range(1000)]
     for probability in (0.0, 0.25, 1.0):

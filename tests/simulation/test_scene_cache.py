@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.hands import write_with_preshapes
 from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 
 from drakegrasp.config import CameraConfig, Config
@@ -19,7 +18,6 @@ from drakegrasp.simulation import scene_cache
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene_cache import (
     DIAGRAMS,
-    KEPT,
     cached_renderer,
     cached_scene,
     forget_scenes,
@@ -59,17 +57,6 @@ def test_scene_of_another_mass_shape_or_physics_is_another(
     assert np.isclose(cached_scene(heavy, config.physics, config.hand).model.mass, 2.0 * cube.mass)
 
 
-def test_least_recently_used_diagram_goes_first(cube: ObjectModel, config: Config) -> None:
-    objects = [replace(cube, mass=mass) for mass in np.linspace(0.5, 1.5, KEPT + 1).tolist()]
-    first, second = (cached_scene(model, config.physics, config.hand) for model in objects[:2])
-    for model in objects[2:KEPT]:
-        cached_scene(model, config.physics, config.hand)
-    assert cached_scene(objects[0], config.physics, config.hand) is first
-    cached_scene(objects[KEPT], config.physics, config.hand)
-    assert cached_scene(objects[0], config.physics, config.hand) is first
-    assert cached_scene(objects[1], config.physics, config.hand) is not second
-
-
 def test_scenes_are_forgotten_and_renderers_stay(cube: ObjectModel, config: Config) -> None:
     scene = cached_scene(cube, config.physics, config.hand)
     renderer = cached_renderer(cube, CameraConfig())
@@ -104,15 +91,3 @@ def test_few_diagrams_are_kept_and_scenes_go_with_theirs(cube: ObjectModel, conf
         cached_scene(cube, physics, config.hand)
     plants = {id(scene.plant) for scene in scene_cache._kept.values()}
     assert len(plants) == len(scene_cache._diagrams) == DIAGRAMS
-
-
-def test_scenes_of_all_preshapes_are_kept(
-    cube: ObjectModel, config: Config, tmp_path: Path
-) -> None:
-    """Attempts take them in turns: each would be built again."""
-    shapes = {name: "F1 F3" for name in ("one", "two", "three", "four")}
-    path, every = str(write_with_preshapes(tmp_path, **shapes)), (None, *range(len(shapes)))
-    first = [cached_scene(cube, config.physics, path, i) for i in every]
-    again = [cached_scene(cube, config.physics, path, i) for i in every]
-    assert len(every) > max(KEPT, DIAGRAMS)
-    assert all(one is other for one, other in zip(first, again, strict=True))

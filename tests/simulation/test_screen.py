@@ -22,7 +22,7 @@ from helpers.objects import (
 from drakegrasp.config import ScreenConfig
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.finger_sweep import GAP_STRIDE, hand_paths
+from drakegrasp.hand.finger_sweep import hand_paths
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -78,27 +78,6 @@ def test_open_hand_deep_in_the_object_or_the_table_is_a_collision(cube, hand, co
         assert record.outcome is Outcome.START_COLLISION
 
 
-def test_object_under_one_finger_only_is_screened(cube, hand):
-    """The palm beside the cube: one fingertip may meet it, the others close on nothing."""
-    attempt = from_above(cube, STANDOFF)
-    aside = replace(attempt, X_OG=make_pose(np.eye(3), [0.0, 0.12, 0.0]) @ attempt.X_OG)
-    assert ask(cube, hand, aside).outcome is Outcome.SCREENED
-
-
-def test_fingertip_that_meets_the_object_beside_its_pad_is_screened(cube, hand):
-    """The cube is between the ends of the fingertips: their first 5 mm do not come to it."""
-    base = {"pad_region": ((-1.0, 0.0, 0.0, -0.005),), "pad_point": (0.0, 0.009, 0.0)}
-    backs = tuple(replace(finger, **base) for finger in hand.fingers)
-    assert ask(cube, hand, from_above(cube, STANDOFF)).outcome is None
-    found = ask(cube, replace(hand, fingers=backs), from_above(cube, STANDOFF))
-    assert found.outcome is Outcome.SCREENED
-
-
-def test_wide_margins_screen_nothing_that_could_touch(cube, hand):
-    attempt = from_above(cube, 0.11)
-    assert ask(cube, hand, attempt, reach_margin=0.2, block_margin=1.0).outcome is None
-
-
 def test_it_is_not_asked_where_it_has_nothing_to_say(cube, hand):
     attempt = from_above(cube, STANDOFF)
     assert ask(cube, hand, replace(attempt, ray_hits=False)) is None
@@ -145,11 +124,6 @@ def test_nothing_that_is_screened_would_have_been_lifted(tmp_path, hand, config)
     assert len(lost) == 20
     outcomes = {run_attempt(scene, X_TO, attempt, OFF).outcome for attempt in lost}
     assert outcomes <= {Outcome.START_COLLISION, Outcome.MISSING_FINGERTIP}
-
-
-@pytest.mark.parametrize(("text", "mode"), [("on", "on"), ("off", "off"), ("false", "off")])
-def test_mode_is_a_word_that_yaml_takes_for_a_truth_value(text, mode):
-    assert load_config(overrides=[f"screen.mode={text}"]).screen.mode == mode
 
 
 def crate(folder, length: float) -> ObjectModel:
@@ -231,22 +205,6 @@ def test_sweep_finds_what_a_look_at_every_angle_finds(cube, hand, config):
             assert not arrives or sweep.last[row] == last
             kinds.add((start > 0, arrives))
     assert {(True, True), (True, False)} <= kinds
-
-
-def test_fingers_start_before_they_may_cross(hand):
-    """All close alike: at no moment on the way do two fingertips come near each other."""
-    paths = hand_paths(hand, float(np.deg2rad(22.5)))
-    ends = np.array([[len(path.angles) - 1 for path in paths.fingers], [20, 30, 40]])
-    starts = screen._clear_starts(paths, ends)
-    assert np.array_equal(starts[1], ends[1])
-    assert np.all(starts[0] < ends[0])
-
-    def gap(k: int) -> float:
-        return min(gap[k // GAP_STRIDE, k // GAP_STRIDE] for gap in paths.gaps.values())
-
-    (start,) = set(starts[0].tolist())
-    assert all(gap(k) > screen.FINGER_GAP for k in range(0, start + 1, GAP_STRIDE))
-    assert gap(start + GAP_STRIDE) <= screen.FINGER_GAP
 
 
 def test_fingers_start_before_they_may_cross_in_an_attempt(cube, hand):

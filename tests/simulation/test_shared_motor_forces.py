@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,8 +17,7 @@ from drakegrasp.hand.finger_sweep import find_opposition, find_pinch
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.simulation import drive as drive_module
-from drakegrasp.simulation import screen as centring
-from drakegrasp.simulation.attempt import Attempt, Source
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import disengage, drive_of, engage, opening_torques
 from drakegrasp.simulation.scene import (
@@ -85,10 +83,6 @@ def test_a_pinch_stays_whichever_way_gravity_acts(tmp_path: Path, axis: int) -> 
     assert np.ptp(hand_positions(scene)) < 3e-6
 
 
-def test_two_equal_motors_do_not_hold_along_their_line(tmp_path: Path) -> None:
-    assert slip(pinched(gripper(tmp_path, one_motor=False)), np.array([0.0, 1.0, 0.0])) > 0.005
-
-
 def test_the_load_of_a_motor_is_that_of_all_its_fingers(tmp_path: Path) -> None:
     scene = pinched(gripper(tmp_path, one_motor=True))
     release(scene)
@@ -127,31 +121,3 @@ def test_a_palm_stays_where_nothing_is_between_its_jaws(tmp_path: Path) -> None:
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.2, 0.01, 0.08])
     (found,) = centred(model, hand, [Attempt(X_OG=X_OG, spread=0.0)])
     np.testing.assert_array_equal(found.X_OG, X_OG)
-
-
-@pytest.mark.parametrize("still", [{0}, {1}, {0, 1}])
-def test_a_palm_stays_where_a_pad_does_not_move(
-    still: set[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As at the ends of a linkage: there is no direction in which to move."""
-    hand, sides = gripper(tmp_path, one_motor=True), itertools.cycle((0, 1))
-    moved = centring._pad_motion
-    monkeypatch.setattr(centring, "_pad_motion", lambda *a: moved(*a) * (next(sides) not in still))
-    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, 0.004, 0.08])
-    (found,) = centred(box(), hand, [Attempt(X_OG=X_OG, spread=0.0)])
-    np.testing.assert_array_equal(found.X_OG, X_OG)
-
-
-def test_jaws_with_motors_of_their_own_are_not_centred(tmp_path: Path) -> None:
-    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.01, 0.08])
-    attempt = Attempt(X_OG=X_OG, spread=0.0)
-    (found,) = centred(box(), gripper(tmp_path, one_motor=False), [attempt])
-    assert found is attempt
-
-
-def test_a_posture_is_not_centred(tmp_path: Path) -> None:
-    """One whose fingers start open is an attempt like any other, but the palm pose is given."""
-    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, 0.004, 0.08])
-    attempt = Attempt(X_OG=X_OG, spread=0.0, source=Source.POSTURES)
-    (found,) = centred(box(), gripper(tmp_path, one_motor=True), [attempt])
-    assert found is attempt

@@ -38,14 +38,6 @@ def test_path_goes_from_rest_to_rest_at_the_target(path):
         assert np.allclose([v, a], 0.0)
 
 
-def test_velocity_and_acceleration_are_the_paths_derivatives(path):
-    step = 1e-5
-    for time in np.linspace(0.1, 0.9, 7) * path.duration:
-        before, now, after = (path.at(time + shift) for shift in (-step, 0.0, step))
-        assert np.allclose((after[0] - before[0]) / (2.0 * step), now[1], atol=1e-7)
-        assert np.allclose((after[1] - before[1]) / (2.0 * step), now[2], atol=1e-7)
-
-
 @pytest.mark.parametrize("overrides", [[], ["lift.max_speed=5.0"]])
 def test_path_keeps_both_limits_and_meets_one(overrides):
     config = load_config(overrides=overrides)
@@ -68,14 +60,6 @@ def test_wrenches_are_the_extremes_of_the_motion(path, cube):
     forces = np.array([carrying_force(cube, path.at(time)[2]) for time in times]) @ along
     assert forces.max() == pytest.approx(path.R_WO @ up[3:] @ along, rel=1e-6)
     assert forces.min() == pytest.approx(path.R_WO @ down[3:] @ along, rel=1e-6)
-
-
-def test_path_of_an_object_at_its_target_stays(cube):
-    config = load_config()
-    path = lift_path(make_pose(np.eye(3), config.lift.p_TG), config)
-    assert path.duration > 0.0
-    assert np.allclose(path.at(0.5 * path.duration)[1:], 0.0)
-    assert np.allclose(path.wrenches(cube)[:, 5], cube.mass * GRAVITY)
 
 
 def test_margin_of_a_pinched_cube_is_its_closed_form(cube):
