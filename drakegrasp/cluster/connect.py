@@ -20,7 +20,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import monotonic, sleep
 from typing import Any, TypedDict
 
 import dask
@@ -37,8 +36,8 @@ from drakegrasp.runtime.journal import wall_limit
 
 #: Address that only this machine can reach.
 LOOPBACK = "127.0.0.1"
-#: How long to wait for a scheduler to answer, and how long it may take to write its file [s].
-CONNECT_SECONDS, WRITE_SECONDS = 10, 2
+#: How long to wait for a scheduler to answer [s].
+CONNECT_SECONDS = 10
 #: Number of tasks that the scheduler sends to a worker per thread. If a running task kills the
 #: worker, Dask would also blame a task that waits behind it.
 SATURATION = 1.0
@@ -286,21 +285,14 @@ def _connect_remote(address: str, security: Security | None, tls: bool) -> Clien
 
 
 def _address_in(file: Path) -> str:
-    """Return the address in a scheduler's file, which may be about to be written.
+    """Return the address in a scheduler's file.
 
     Raises:
-        MachineError: If the file has no address after `WRITE_SECONDS`.
+        MachineError: If the file has none.
     """
-    end = monotonic() + WRITE_SECONDS
-    while True:
-        address = None
-        with suppress(OSError, ValueError, LookupError, TypeError):
-            address = read_json(file)["address"]
-        if isinstance(address, str):
-            return address
-        if monotonic() > end:
-            raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
-        sleep(0.05)
+    with suppress(OSError, ValueError, LookupError, TypeError):
+        return str(read_json(file)["address"])
+    raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
 
 
 class _RemoteClient(Client):

@@ -11,38 +11,15 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from dask.utils import parse_timedelta
-from distributed import Client, KilledWorker, LocalCluster, SpecCluster
+from distributed import Client, KilledWorker, LocalCluster
 
 from drakegrasp.cluster import executor as tasks
-from drakegrasp.cluster.connect import connect, dask_settings
+from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.errors import BlankImageError, MachineError
-from drakegrasp.generation.prepare import PREPARE_SECONDS
-from drakegrasp.runtime.journal import wall_limit
 from drakegrasp.vision import rendering
 
 pytestmark = pytest.mark.cluster
-
-
-def test_scheduler_is_more_patient_than_the_limits_of_steps() -> None:
-    """A step may hold the interpreter, so that its worker gives no sign of life."""
-    patience = parse_timedelta(dask_settings()["distributed.scheduler.worker-ttl"])
-    assert patience > wall_limit(PREPARE_SECONDS)
-
-
-@pytest.mark.nightly
-def test_worker_that_takes_its_time_to_end_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def late(cluster: SpecCluster, timeout: float | None = None) -> None:
-        close(cluster, timeout)
-        raise TimeoutError
-
-    close = SpecCluster.close
-    monkeypatch.setattr(SpecCluster, "close", late)
-    with connect(workers=1) as client:
-        assert client.submit(abs, -1).result() == 1
-    with pytest.raises(KeyboardInterrupt), connect(workers=1):
-        raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module")

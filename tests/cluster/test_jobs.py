@@ -175,17 +175,6 @@ def test_what_dask_jobqueue_misses_is_one_line(tmp_path: Path) -> None:
         cluster_of("htcondor", workers=1, walltime="1:00")
 
 
-def test_workers_run_the_kernel_of_blas_that_the_caller_chose(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A job inherits nothing, and the last bits of a lift depend on the kernel."""
-    key = "distributed.nanny.pre-spawn-environ"
-    monkeypatch.setenv("OPENBLAS_CORETYPE", "Prescott")
-    assert dask_settings()[key]["OPENBLAS_CORETYPE"] == "Prescott"
-    monkeypatch.delenv("OPENBLAS_CORETYPE")
-    assert "OPENBLAS_CORETYPE" not in dask_settings()[key]
-
-
 #: Jobs of three workers with 2 GB each: what is typed, the command that submits a job, and the
 #: lines that ask for what was typed.
 ASKED = {

@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import dask
@@ -29,7 +28,6 @@ from helpers.scripts import PIPELINES, load_script
 
 import drakegrasp
 from drakegrasp import registry
-from drakegrasp.cluster import connect as connecting
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.choice import cluster_of
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, made_or_given, make_certificates
@@ -175,20 +173,6 @@ def test_keys_are_private_and_removed(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_script_makes_certificates_in_a_new_folder_of_its_own(tmp_path: Path) -> None:
-    arguments = [str(tmp_path / "keys")]
-    result = run_command(*arguments, command=load_script("make_certificates").main)
-    assert result.exit_code == 0, result.output
-    assert stat.S_IMODE((tmp_path / "keys").stat().st_mode) == 0o700
-    files = [Path(line) for line in result.stdout.splitlines()]
-    assert [path.name for path in files] == ["ca.pem", "cert.pem", "key.pem"]
-    assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
-    again = run_command(*arguments, command=load_script("make_certificates").main)
-    assert again.exit_code == 1
-    (line,) = again.stderr.splitlines()
-    assert "keys: must be a folder that can be made: " in line
-
-
 def test_nothing_that_is_read_can_run() -> None:
     """No pickles from the disk, and YAML only by its safe loader."""
     package = Path(drakegrasp.__file__).parent
@@ -206,16 +190,6 @@ def test_nothing_that_is_read_can_run() -> None:
                 assert name not in ("yaml.load", "yaml.full_load", "yaml.unsafe_load"), path
             if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
                 assert isinstance(node.value, ast.Constant) and node.value.value is False, path
-
-
-@pytest.mark.parametrize(("there", "words"), [(True, "http://127.0.0.1:1"), (False, "pip install")])
-def test_dashboard_is_linked_where_it_is_served(
-    monkeypatch: pytest.MonkeyPatch, there: bool, words: str
-) -> None:
-    monkeypatch.setattr(connecting, "has_dashboard", lambda: there)
-    line = connecting.dashboard_line(SimpleNamespace(dashboard_link="http://127.0.0.1:1/status"))
-    assert line.startswith("dashboard: ")
-    assert words in line
 
 
 @pytest.fixture
@@ -297,20 +271,6 @@ def test_only_the_loopback_address_is_listened_on_and_not_for_http(local: Client
     ]
     assert sorted(listening) == sorted(addresses(local))
     assert all(address.startswith("tls://127.0.0.1:") for address in listening)
-
-
-def test_scheduler_file_that_is_being_written_is_read_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "scheduler.json"
-    file.write_text('{"addr')
-
-    def write_rest(_: float) -> None:
-        file.write_text('{"address": "tcp://127.0.0.1:8786"}')
-
-    monkeypatch.setattr(connecting, "sleep", write_rest)
-    with pytest.raises(ConfigError, match="got tcp://127"), connect(scheduler_file=file):
-        pass
 
 
 @pytest.mark.nightly

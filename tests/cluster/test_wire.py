@@ -15,11 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 import pytest
 import trimesh
 from distributed import Client, LocalCluster, Worker
-from helpers import faults
 from helpers.builds import FAST, build
 from helpers.file_tasks import Join, join
 from helpers.tiers import in_second_tier
@@ -34,16 +32,12 @@ from drakegrasp.cluster.wire import by_wire
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
-from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.generation.pipeline import BuildReport
-from drakegrasp.generation.request import build_config
-from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool, run_here
-from drakegrasp.runtime.journal import VARIABLE
-from drakegrasp.simulation.attempts import Attempts, make_attempts
+from drakegrasp.simulation.attempts import Attempts
 
 pytestmark = pytest.mark.cluster
 
@@ -253,46 +247,12 @@ def test_every_kind_of_task_gives_the_same_bytes(
         assert file["trials/outcome"][0] == Outcome.SUCCESS
 
 
-@pytest.mark.nightly
-@pytest.mark.sim
-def test_postures_travel(client: Client, meshes: Path, out: Path, tmp_path: Path) -> None:
-    """Two palm poses over the box, along either edge, replace the drawn ones."""
-    over = make_pose(rotation_about([1.0, 0.0, 0.0], np.pi), [0.0, 0.0, 0.162])
-    turned = over @ make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2), np.zeros(3))
-    names, X_TG = ["1_box_a"] * 2, np.stack([over, turned])
-    given = make_attempts(load_hand(), names, X_FG=X_TG, frame="table", resting=[0, 0])
-    config, here = build_config(load_config(overrides=FAST), given), tmp_path / "here"
-    build(find_meshes(meshes), here, config, run_here, postures=given, show=False)
-    build_by_wire(client, meshes, out, config, given)
-    assert_same_files(here, out)
-    with h5py.File(out / "trials.hdf5") as file:
-        assert file["trials/posture_row"][:].tolist() == [0.0, 1.0]
-        np.testing.assert_array_equal(file["trials/outcome"][:], Outcome.SUCCESS)
-
-
 def build_by_wire(
     client: Client, meshes: Path, out: Path, config: Config, postures: Attempts | None = None
 ) -> BuildReport:
     with by_wire(DaskExecutor(client), client, out) as execute:
         rest = {"pool": WorkerPool(), "postures": postures, "show": False}
         return build(find_meshes(meshes), out, config, execute, **rest)
-
-
-@pytest.mark.nightly
-@pytest.mark.sim
-def test_attempt_that_crashes_its_process_costs_itself_alone(
-    client: Client, meshes: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config, here = load_config(overrides=FAST), tmp_path / "here"
-    build(find_meshes(meshes), here, config, run_here, show=False)
-    monkeypatch.setenv(VARIABLE, faults.setting("crash:1_box_a:3:1"))
-    build_by_wire(client, meshes, out, config)
-    with h5py.File(here / "trials.hdf5") as one, h5py.File(out / "trials.hdf5") as other:
-        expected, found = (file["trials/outcome"][:] for file in (one, other))
-    crashed = found == Outcome.CRASHED
-    assert np.flatnonzero(crashed).tolist() == [10]
-    assert (found == expected)[~crashed].all()
-    assert not list(out.rglob("*.journal"))
 
 
 @pytest.mark.nightly

@@ -76,25 +76,6 @@ def assert_clean(out: Path, *patterns: str) -> None:
 
 @pytest.mark.nightly
 @pytest.mark.cluster
-def test_a_killed_worker_changes_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    begin(out, undisturbed, units=1)
-    process = start_build(meshes, out, workers=1)
-    while not list(out.glob("shards/*/*.journal")):
-        assert process.poll() is None
-        time.sleep(0.02)
-    (worker,) = workers_of(process.pid)
-    os.kill(worker, signal.SIGKILL)
-    # A journal outlives its process.
-    assert list(out.glob("shards/*/*.journal"))
-    said, _ = finish(process)
-    assert "2 work units simulated" in said
-    assert_same_dataset(undisturbed, out)
-    assert_clean(out)
-
-
-@pytest.mark.nightly
-@pytest.mark.cluster
 def test_random_kills_change_nothing(meshes: Path, tmp_path: Path) -> None:
     """All of four workers are killed while objects are prepared, and many times one of them.
 
@@ -199,26 +180,6 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
             assert b["trials/outcome"][places.index(place)] == outcome
             assert np.isnan(b["trials/closed_q"][places.index(place)]).all()
     assert_clean(out)
-
-
-@pytest.mark.nightly
-@pytest.mark.cluster
-def test_suspended_worker_changes_no_label(meshes: Path, tmp_path: Path) -> None:
-    """As SLURM suspends a job: for longer than an attempt may take."""
-    out = tmp_path / "out"
-    few = ("--set", "candidates.max=6")
-    process = start_build(meshes, out, 1, "--set", "attempt_seconds=2", *few)
-    for shards, seconds in ((1, 4.0), (4, 4.0)):
-        wait_for_shards(out, shards)
-        (worker,) = workers_of(process.pid)
-        os.kill(worker, signal.SIGSTOP)
-        time.sleep(seconds)
-        os.kill(worker, signal.SIGCONT)
-    finish(process)
-    with h5py.File(out / "trials.hdf5") as file:
-        outcomes = file["trials/outcome"][:]
-    assert len(outcomes) == 36
-    assert not set(outcomes) & {Outcome.TIMEOUT, Outcome.CRASHED}
 
 
 @pytest.mark.nightly

@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 from cross_check import cross_check
-from helpers.assertions import assert_same_arrays
 from helpers.builds import build
 from helpers.meshes import write_fixed
 
@@ -125,21 +124,6 @@ def test_lifts_are_tried_elsewhere_as_they_lay(
     ids = [lift["trial_id"] for lift in lifts]
     assert len(np.unique(columns["resting"][ids])) > 1
     np.testing.assert_array_equal(stood, [unpack_pose(columns["X_TO"][i]) for i in ids])
-
-
-@pytest.mark.nightly
-def test_more_palm_poses_extend_a_dataset(
-    dataset: Path, sources: list[MeshSource], config: Config, tmp_path: Path
-) -> None:
-    """Eight and then sixteen give what sixteen give at once; only the last unit is run."""
-    fewer = override_config(config, ["candidates.max=8"])
-    build(sources[:1], tmp_path, fewer, run_here, show=False)
-    report = build(sources[:1], tmp_path, config, run_here, show=False)
-    assert (report.simulated, report.reused) == (1, 1)
-    shards = sorted(tmp_path.glob("shards/*/*.h5"))
-    assert len(shards) == 2
-    for shard in shards:
-        assert_same_arrays(shard, dataset / shard.relative_to(tmp_path))
 
 
 def test_target_is_met_and_extended(

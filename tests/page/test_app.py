@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,11 @@ import pytest
 from helpers.datasets import (
     OTM,
     SLIP,
-    SLIPPED,
     TRIALS,
     change,
-    end_lift,
     set_at,
 )
 from helpers.pages import ATTACK, Tags, coded, get, numbered, open_pages, state_of, surface_of
-from matplotlib.image import imread
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.assemble import assemble
@@ -61,16 +57,6 @@ def test_gallery_shows_what_is_selected_page_by_page(client: TestClient) -> None
     # A page beyond the last is the last.
     assert "page 2 of 2" in client.get("/?outcome=any&page=99").text
     assert "No attempt fits" in client.get("/?object=nothing").text
-
-
-def test_contacts_are_drawn_in_all_three_images(client: TestClient) -> None:
-    card = client.get("/?object=1_box_a&sort=row&order=up").text.partition("</li>")[0]
-    assert card.count("<circle") == 9
-    assert coded(state_of(client), "/strip/0-0-0-oto.png") in card
-    strip = imread(BytesIO(get(client, "/strip/0-0-0-oto.png").content))
-    assert strip.shape[:2] == (32, 96)
-    for address in ("0-0-1-oto", "0-0-0-out", "9-9-9-oto", "x-oto"):
-        assert get(client, f"/strip/{address}.png").status_code == 404
 
 
 def test_page_says_which_images_cannot_be_read(out: Path) -> None:
@@ -119,24 +105,6 @@ def test_page_of_a_grasp_has_numbers_and_a_scene(client: TestClient) -> None:
     assert closed["contacts"][0]["f"] == pytest.approx([-10.0 * x, -10.0 * y, 0.0], abs=1e-9)
     lifted = [0.03 * x + SLIP * y, 0.03 * y - SLIP * x, 0.025]
     assert scene["states"]["lifted"]["contacts"][0]["p"] == pytest.approx(lifted)
-
-
-def test_failed_attempt_is_shown_as_far_as_it_got(client: TestClient) -> None:
-    page = get(client, "/grasp/0-2-1").text
-    assert "ray miss" in page
-    assert 'data-state="start"' in page
-    assert 'data-state="closed"' not in page
-    assert "data-decide" not in page
-    assert "Only samples have images" in page
-
-
-def test_lift_that_was_ended_is_said_to_have_no_verdict(out: Path) -> None:
-    end_lift(out, SLIPPED, 0.02)
-    client = open_pages(out)
-    gallery = get(client, "/?outcome=moved").text
-    assert gallery.count("lift ended, not judged") == 1
-    assert "moved: no images" in gallery
-    assert "lift ended, not judged" not in get(client, "/?outcome=dropped").text
 
 
 def test_meshes_are_there(client: TestClient) -> None:
@@ -295,15 +263,6 @@ def test_a_page_names_the_file_of_meshes_that_is_not_there(client: TestClient, o
     assert f"There is no file objects/{path.name}" in page
 
 
-def test_answers_say_what_is_decided_in_all(client: TestClient) -> None:
-    for number, label in enumerate(("0-0-0", "1-1-0", "2-0-0"), start=1):
-        counts = decide(client, label, "rejected").json()["counts"]
-        assert counts == {"rejected": number, "samples": number}
-    undone = client.post("/undo", headers={TOKEN_HEADER: token(client)}).json()
-    assert undone["name"] == "3_brick, palm pose 0, stand-off 0"
-    assert undone["counts"] == {"rejected": 2, "samples": 2}
-
-
 @pytest.mark.parametrize("path", ["/", "/grasp/0-0-0"])
 def test_pages_say_how_to_take_rejected_grasps_out(boxes: Path, tmp_path: Path, path: str) -> None:
     """The command can be pasted into a shell, whatever the directory is called."""
@@ -321,29 +280,6 @@ def test_pages_say_how_to_take_rejected_grasps_out(boxes: Path, tmp_path: Path, 
             f"1 rejected, 1 of them samples now. To take them out of the files: {command}" in text
         )
         assert f"drakegrasp replay '{out}' --trial 0" in Tags(get(client, "/grasp/0-0-0").text).text
-
-
-def test_samples_can_be_chosen_in_one_step(out: Path) -> None:
-    assemble(out, rejected=[0])
-    client = open_pages(out)
-    page = client.get("/").text
-    links = {a.get("href") for tag, a in Tags(page).tags if tag == "a"}
-    assert "/?split=samples" in links
-    options = re.findall(r'<select name="split">(.*?)</select>', page, re.S)[0]
-    assert re.findall(r'value="(\w*)"', options)[:2] == ["", "samples"]
-    # What filters keep is called samples, and nothing but a decision is called kept.
-    removals = re.findall(r'<select name="removal">(.*?)</select>', page, re.S)[0]
-    assert re.findall(r'value="(\w*)"', removals) == ["", "rejected"]
-    assert "8 of 36 attempts" in " ".join(Tags(client.get("/?split=samples").text).text.split())
-
-
-def test_page_of_a_grasp_has_friction(client: TestClient, out: Path) -> None:
-    page = get(client, "/grasp/0-0-0").text
-    with h5py.File(out / TRIALS) as file:
-        friction = float(file["trials/friction_hand"][0])
-    assert f"<th>friction of the object with the hand</th><td>{friction:.3f}</td>" in page
-    # An attempt that never closed has dashes.
-    assert "<th>other links after closing</th><td>–</td>" in get(client, "/grasp/0-2-1").text
 
 
 def test_a_contact_without_a_normal_is_a_reason(out: Path) -> None:

@@ -16,20 +16,15 @@ import h5py
 import numpy as np
 import pytest
 import uvicorn
-from helpers.pages import ATTACK, coded, numbered
+from helpers.pages import coded, numbered
 from helpers.predictions import write_predictions
 from matplotlib.image import imread
 
-from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.rejections import (
     AttemptKey,
-    Decisions,
     read_decisions,
-    read_rejected,
-    write_decisions,
 )
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.filters import Removal
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.page.app import Inspection, listen, make_app
 from drakegrasp.page.catalog import Snapshot, read_snapshot
@@ -261,20 +256,6 @@ def test_keyboard_moves_rejects_and_undoes(
     page.wait_for_selector("#cards")
 
 
-@pytest.mark.parametrize("first", ["[data-layer=forces]", ""])
-def test_keys_work_whatever_was_done_before(
-    page: Page, address: str, state: Snapshot, out: Path, first: str
-) -> None:
-    """After a click on a checkbox, and with Caps Lock."""
-    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
-    wait_for_view(page)
-    if first:
-        page.click(first)
-    page.keyboard.press("r" if first else "R")
-    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
-    wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "rejected")
-
-
 def test_the_gallery_counts_undoes_and_says_what_to_do_next(
     page: Page, address: str, state: Snapshot, out: Path
 ) -> None:
@@ -294,22 +275,6 @@ def test_the_gallery_counts_undoes_and_says_what_to_do_next(
     page.wait_for_selector("#message:has-text('Nothing to undo.')")
 
 
-def test_buttons_reject_and_assembly_drops_exactly_these(
-    page: Page, address: str, state: Snapshot, out: Path
-) -> None:
-    page.goto(address)
-    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
-    page.wait_for_selector(coded(state, "[data-label='1-1-0'].rejected"))
-    assert read_decisions(out / "reject.json").of(AttemptKey("2_box_b", 1, 0)) == "rejected"
-    page.click(coded(state, "[data-label='2-0-0'] [data-decide=rejected]"))
-    page.wait_for_selector(coded(state, "[data-label='2-0-0'].rejected"))
-    # The same button again withdraws the decision.
-    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
-    wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
-    assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
-    assert assembly.removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
-
-
 def test_a_server_that_has_ended_is_named(browser: Browser, out: Path, state: Snapshot) -> None:
     page = browser.new_page()
     served = serve(out)
@@ -319,17 +284,6 @@ def test_a_server_that_has_ended_is_named(browser: Browser, out: Path, state: Sn
     page.wait_for_selector("#message:not([hidden])", timeout=PATIENCE)
     assert "does not answer" in page.inner_text("#message")
     page.close()
-
-
-def test_a_name_that_is_a_script_stays_text(page: Page, hostile: Path) -> None:
-    state = read_snapshot(hostile)
-    for address in serve(hostile):
-        page.goto(address)
-        assert page.locator("#cards h2", has_text=ATTACK).count() == 3
-        page.goto(coded(state, f"{address}/grasp/0-0-0"))
-        wait_for_view(page)
-        assert ATTACK in page.inner_text("h1")
-        assert page.locator("h1 script").count() == 0
 
 
 #: The smallest contrast of a text to what is behind it, with that text. Disabled things and text in
@@ -361,42 +315,6 @@ CONTRAST = """() => {
   }
   return worst;
 }"""
-
-
-def test_text_stands_out_in_both_themes(
-    page: Page, out: Path, tmp_path: Path, state: Snapshot
-) -> None:
-    results = write_predictions(out, tmp_path / "run.h5")
-    decisions = Decisions(rejected=frozenset([AttemptKey("1_box_a", 0, 0)]))
-    write_decisions(out / "reject.json", decisions)
-    for address in serve(out, results):
-        for path in ("/", "/grasp/0-0-0", "/predictions", "/prediction/0"):
-            page.goto(address + coded(state, path))
-            page.keyboard.press("?")
-            for theme in ("light", "dark"):
-                page.select_option("#theme", theme, force=True)
-                contrast, text = page.evaluate(CONTRAST)
-                assert contrast >= 4.5, f"{theme} {path}: {text!r} has {contrast:.2f}"
-
-
-def test_the_theme_that_is_chosen_is_remembered(page: Page, address: str, state: Snapshot) -> None:
-    def background() -> str:
-        return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
-
-    page.goto(coded(state, f"{address}/grasp/0-0-0"))
-    wait_for_view(page)
-    light, view = background(), page.locator("#view3d").screenshot()
-    page.emulate_media(color_scheme="dark")
-    wait_until(page, lambda: background() != light)
-    dark = background()
-    # The 3D view follows.
-    assert page.locator("#view3d").screenshot() != view
-    page.select_option("#theme", "light")
-    assert background() == light
-    page.goto(address)
-    assert background() == light
-    page.select_option("#theme", "")
-    assert background() == dark
 
 
 def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> None:

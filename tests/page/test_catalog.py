@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import h5py
@@ -55,17 +54,6 @@ def test_rows_and_images_are_those_of_the_attempt(boxes: Path) -> None:
     assert read_look(snapshot, i + 1, "otm") is None
 
 
-def test_data_files_alone_are_enough_for_images(out: Path) -> None:
-    for folder in ("shards", "objects"):
-        shutil.rmtree(out / folder)
-    (out / "manifest.json").unlink()
-    (out / OTM).unlink()
-    snapshot = read_snapshot(out)
-    assert read_look(snapshot, 0, "oto") is not None
-    assert read_look(snapshot, 0, "otm") is None
-    assert [line.split()[0] for line in snapshot.missing] == [OTM, "3"]
-
-
 def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
     change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
     snapshot = read_snapshot(out)
@@ -73,14 +61,6 @@ def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
     table = Attempts(snapshot, Decisions())
     assert table.select(Attempts.query({"min_normal_angle": "10"})).tolist() == [0]
     assert table.select(Attempts.query({"sort": "normal_angle"}))[0] == 0
-
-
-def test_another_schema_is_one_message(out: Path) -> None:
-    with h5py.File(out / TRIALS, "r+") as file:
-        file.attrs["schema_version"] = 2
-    with pytest.raises(DataError) as caught:
-        read_snapshot(out)
-    assert str(caught.value).count(TRIALS) == 1
 
 
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:

@@ -16,8 +16,6 @@ from helpers.pages import Tags
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
-from drakegrasp.cli.verify import Target, place
-from drakegrasp.dataset.reader import GraspDataset, read_predicted_rows
 from drakegrasp.errors import DataError
 from drakegrasp.page.app import Inspection, make_app
 
@@ -109,11 +107,6 @@ def test_a_palm_that_never_closed_is_shown_open(out: Path, results: Path) -> Non
     assert states["start"]["links"] != closed["links"]
 
 
-def test_other_numbers_have_no_page(client: TestClient) -> None:
-    for label in ("4", "x", "-1"):
-        assert client.get(f"/prediction/{label}").status_code == 404
-
-
 def _scene(page: str) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
     assert found is not None
@@ -192,23 +185,3 @@ def test_pages_of_replaced_files_are_refused(
         answer = client.get(path)
         assert answer.status_code == 400
         assert "must stay while it is shown, got another; run inspect again" in answer.text
-
-
-def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> None:
-    """As `verify` finds them: those in the file of predictions, else all of the split."""
-    data = GraspDataset(out / "grasping_oto.hdf5", split="train")
-    rows = np.array([1, 0, 1])
-    with h5py.File(tmp_path / "p.h5", "w") as file:
-        file["grasps"], file["rows"] = data.column("grasps")[rows], rows
-    for path, split, wanted in (
-        (tmp_path / "p.h5", "train", rows),
-        (data.path, "train", np.arange(len(data))),
-    ):
-        _, _, asked = place(path, Target(dataset=data.path, split=split))
-        assert asked is not None
-        with h5py.File(tmp_path / "r.h5", "w") as file:
-            asked.write(file)
-            read = read_predicted_rows(file)
-        assert read is not None
-        assert (read.split, read.camera, read.row.tolist()) == ("train", "oto", wanted.tolist())
-        assert read.trial_id.tolist() == data.column("trial_id")[wanted].tolist()

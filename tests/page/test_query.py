@@ -45,23 +45,6 @@ def test_each_filter_chooses_its_own(snapshot: Snapshot, text: str, labels: list
     assert chosen(snapshot, f"{text}&sort=row&order=up") == labels
 
 
-def test_words_choose_by_how_an_attempt_holds(snapshot: Snapshot) -> None:
-    table = snapshot.table
-    precision, stable = table.precision.copy(), table.stable.copy()
-    precision[12] = stable[12] = stable[15] = False
-    changed = replace(snapshot, table=table.with_columns(precision=precision, stable=stable))
-    counts = {
-        hold: len(chosen(changed, f"hold={hold}")) for hold in ("held", "precision", "stable")
-    }
-    assert counts == {"held": 9, "precision": 8, "stable": 7}
-
-
-def test_splits_are_a_partition_of_the_samples(snapshot: Snapshot) -> None:
-    parts = [chosen(snapshot, f"split={split}") for split in ("train", "valid", "test")]
-    assert sorted(label for part in parts for label in part) == sorted(chosen(snapshot, ""))
-    assert all(parts)
-
-
 def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
     split = snapshot.table.split.copy()
     split[[0, 3]] = NONE

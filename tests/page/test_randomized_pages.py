@@ -8,13 +8,10 @@ import h5py
 import numpy as np
 import pytest
 from helpers.datasets import TRIALS, make_dataset
-from helpers.pages import get
-from starlette.testclient import TestClient
 
 from drakegrasp.dataset.quality import GRAVITY
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
-from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.catalog import read_snapshot
 from drakegrasp.page.looks import THUMBNAIL, contact_dots, read_rows
 from drakegrasp.vision.camera import intrinsics, project
@@ -44,26 +41,6 @@ def test_suspicion_is_of_the_drawn_mass(drawn: Path) -> None:
     snapshot, expected = read_snapshot(drawn), imbalance(drawn)
     for i in (0, 3, 11):
         assert snapshot.table.imbalance[i] == pytest.approx(expected[i], rel=1e-6)
-
-
-def test_the_filters_of_suspicion_are_of_the_drawn_mass(drawn: Path, tmp_path: Path) -> None:
-    """A limit between the values of the drawn masses removes what is above, and only that."""
-    with h5py.File(drawn / TRIALS) as file:
-        values = imbalance(drawn)[file["successes/trial_id"][:]]
-    limit = float(np.median(values))
-    draw = "randomize.mass=[0.5, 1.5]"
-    out = make_dataset(
-        tmp_path / "out", tmp_path, overrides=[draw, f"filters.max_imbalance={limit}"]
-    )
-    with h5py.File(out / TRIALS) as file:
-        np.testing.assert_array_equal(file["successes/removal"][:] == 12, values > limit)
-
-
-def test_page_of_an_attempt_tells_its_own_mass(drawn: Path) -> None:
-    with h5py.File(drawn / TRIALS) as file:
-        mass = float(file["trials/mass"][0])
-    with TestClient(make_app(Inspection(drawn)), base_url="http://127.0.0.1:8321") as client:
-        assert f"{mass:.4g} kg" in get(client, "/grasp/0-0-0").text
 
 
 @pytest.mark.parametrize("camera", ["oto", "otm"])

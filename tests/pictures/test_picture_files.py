@@ -118,14 +118,6 @@ def test_every_sample_is_read_once(sound: Path) -> None:
     np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.125)
 
 
-def test_a_file_without_samples_has_none(sound: Path, tmp_path: Path) -> None:
-    shutil.copy(sound / TRIALS, tmp_path)
-    lose_all(tmp_path)
-    held = read_samples(tmp_path)
-    assert len(held.trial_ids) == 0
-    assert all(len(values) == 0 for values in held.quantities.values())
-
-
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials"):
         read_samples(tmp_path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -15,7 +14,6 @@ from types import SimpleNamespace
 from typing import TypeVar
 
 import pytest
-from helpers.tiers import few
 
 from drakegrasp.cluster.connect import connect
 from drakegrasp.errors import ConfigError, MachineError
@@ -144,36 +142,3 @@ def test_worker_of_a_pool_is_told_to_start_none() -> None:
 def test_process_that_dies_is_one_error() -> None:
     with processes(2) as execute, pytest.raises(MachineError, match="a worker process died"):
         list(execute(os._exit, [1, 1, 1]))
-
-
-INTERRUPTED = """
-import sys, time
-from drakegrasp.runtime.executor import processes
-if __name__ == "__main__":
-    print("begins", flush=True)
-    try:
-        with processes(2) as execute:
-            list(execute(time.sleep, [0.2] * 300))
-    except KeyboardInterrupt:
-        print("stopped")
-"""
-
-
-@pytest.mark.parametrize("seconds", few([0.05, 0.6], 1))
-def test_ctrl_c_while_processes_start_says_nothing(tmp_path: Path, seconds: float) -> None:
-    """It reaches every process of the terminal, also one that has just begun."""
-    script = tmp_path / "script.py"
-    script.write_text(INTERRUPTED)
-    process = subprocess.Popen(
-        [sys.executable, str(script)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "begins\n"
-    time.sleep(seconds)
-    os.killpg(process.pid, signal.SIGINT)
-    said, errors = process.communicate(timeout=60)
-    assert (said, errors, process.returncode) == ("stopped\n", "", 0)

@@ -14,12 +14,10 @@ from helpers.shards import some_shard
 from drakegrasp.dataset.hdf5 import write_field
 from drakegrasp.dataset.schema import Field
 from drakegrasp.dataset.shards import write_shard
-from drakegrasp.runtime import files
 from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.files import (
     atomic_folder,
     atomic_hdf5,
-    probe_folder,
     replaced_together,
     sweep_temporary,
     write_atomic,
@@ -28,13 +26,6 @@ from drakegrasp.runtime.files import (
 
 def everything_in(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.is_file())
-
-
-def test_exception_while_writing_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), atomic_hdf5(tmp_path / "deep" / "file.h5") as file:
-        file["some"] = np.zeros(1000)
-        raise KeyboardInterrupt
-    assert everything_in(tmp_path) == []
 
 
 def test_exception_while_writing_keeps_the_file_that_was_there(tmp_path: Path) -> None:
@@ -73,33 +64,6 @@ def test_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
         file["some"] = np.zeros(3)
         assert not path.exists()
     assert everything_in(tmp_path) == [path]
-
-
-def test_bytes_replace_an_older_file(tmp_path: Path) -> None:
-    path = tmp_path / "deep" / "file.txt"
-    for content in (b"one", b"two\r\n"):
-        write_atomic(path, content)
-        assert path.read_bytes() == content
-    assert everything_in(tmp_path) == [path]
-
-
-def test_probe_leaves_nothing_and_needs_a_folder(tmp_path: Path) -> None:
-    probe_folder(tmp_path)
-    assert everything_in(tmp_path) == []
-    with pytest.raises(FileNotFoundError):
-        probe_folder(tmp_path / "missing")
-
-
-def test_failed_rename_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full disk shows when the file is closed or synced; the temporary file goes then, too."""
-
-    def full(temporary: Path, path: Path) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(files, "sync_and_rename", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_shard(tmp_path, some_shard())
-    assert everything_in(tmp_path) == []
 
 
 def test_file_is_on_the_disk_before_it_has_its_name(

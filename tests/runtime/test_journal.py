@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers import faults
 from helpers.tiers import few, in_second_tier
@@ -140,14 +138,6 @@ def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> N
     assert deaths_until_done(path)[0] == 0
 
 
-def test_journal_says_where_it_died(tmp_path: Path) -> None:
-    run(tmp_path / "journal", "crash:try 4")
-    head, record, *trace = (tmp_path / "journal").read_text().splitlines()
-    assert json.loads(head)["unit"] == UNIT
-    assert record.split(maxsplit=1)[1].strip() == "try 4"
-    assert trace[0] == "Fatal Python error: Segmentation fault"
-
-
 @pytest.mark.parametrize(
     "content", ["", "no journal", '{"unit": 3}\n', '{"deaths": {}}\nhello', "\x00" * 600]
 )
@@ -173,12 +163,6 @@ def test_unit_that_another_process_is_at_is_not_a_dead_one(tmp_path: Path) -> No
         assert (tmp_path / "journal").exists()
 
 
-def test_error_of_a_unit_leaves_no_journal(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="wrong"), open_journal(tmp_path / "journal", UNIT):
-        raise ValueError("wrong")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_kill_leaves_a_journal_without_a_mark(tmp_path: Path) -> None:
     path = tmp_path / "journal"
     process = subprocess.Popen(
@@ -190,27 +174,6 @@ def test_kill_leaves_a_journal_without_a_mark(tmp_path: Path) -> None:
     process.communicate()
     with open_journal(path, UNIT) as journal:
         assert journal.unresolved == ["try 4"]
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_random_kills_convict_nobody(seed: int) -> None:
-    """Two hundred kills at random moments, and every attempt still has its turn."""
-    rng = np.random.default_rng(seed)
-    lengths = rng.gamma(0.5, 1.0, 30)  # a few long attempts have most of the time
-    history = _History()
-    for _ in range(200):
-        order = sorted(range(30), key=lambda i: f"try {i}" not in history.unresolved())
-        ends = np.cumsum(lengths[order])
-        moment = rng.exponential(2.0 * lengths.sum())
-        if moment > ends[-1]:
-            history = _History()  # the unit was done; the next begins
-            continue
-        at = int(np.searchsorted(ends, moment))
-        unresolved = history.unresolved()
-        done = {f"try {i}" for i in order[:at]}
-        passed = sum(1 << k for k, step in enumerate(unresolved) if step in done)
-        history.add(f"try {order[at]}", passed, b"")
-        assert not any(history.verdict(step) for step in history.deaths)
 
 
 def test_unit_that_dies_for_nothing_is_given_up() -> None:
