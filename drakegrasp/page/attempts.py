@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.assembly.removal import own_setting
 from drakegrasp.dataset.paths import DATA_FILES
-from drakegrasp.dataset.quality import PARTS, suspicion
+from drakegrasp.dataset.quality import PARTS
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.trials import NONE
@@ -136,7 +136,6 @@ class Attempts(Gallery):
         snapshot = self.snapshot
         return {
             "title": snapshot.out.name or str(snapshot.out),
-            "missing": snapshot.missing,
             "samples": int(np.count_nonzero(snapshot.table.split != NONE)),
             "only_samples": self._home(query, split="samples", page=1),
             **self._decisions(),
@@ -178,7 +177,7 @@ class Attempts(Gallery):
             look = read_look(snapshot, i, camera)
             unread = DATA_FILES[camera] if look is None else ""
             strip = f"/strip/{i}-{camera}.png"
-            dots = contact_dots(snapshot, row, camera, look)
+            dots = contact_dots(snapshot, row, camera)
             views.append({"camera": camera, "strip": strip, "unread": unread, "dots": dots})
 
         key = snapshot.key(i)
@@ -201,7 +200,7 @@ class Attempts(Gallery):
             "decision": self.decisions.of(key),
             "views": views,
             "score": _text(snapshot, "suspicion", i),
-            "parts": _parts(row),
+            "parts": [(part.shown.title, _text(snapshot, part.name, i)) for part in PARTS],
             "facts": _facts(snapshot, i, row),
             "scene": attempt_scene(snapshot, i, row, hand),
         }
@@ -236,26 +235,6 @@ def _reasons(snapshot: Snapshot, i: int) -> list[str]:
         f"{QUANTITIES[name].title}{'' if np.isfinite(share) else ':'} {_text(snapshot, name, i)}"
         for share, name in large
     ]
-
-
-def _parts(row: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the parts of an attempt's suspicion, with their values divided by their scales."""
-    found = suspicion({name: np.asarray(value)[None] for name, value in row.items()})
-    parts = []
-    for part in PARTS:
-        value, share = float(found.values[part.name][0]), float(found.shares[part.name][0])
-        if np.isnan(value) and np.isfinite(share):
-            value = np.inf  # a contact without a normal
-        parts.append(
-            {
-                "title": part.shown.title,
-                "meaning": part.meaning,
-                "value": part.shown.text(value),
-                "scale": part.shown.text(part.scale),
-                "share": None if np.isnan(share) else round(share, 3),
-            }
-        )
-    return parts
 
 
 def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, str]]:

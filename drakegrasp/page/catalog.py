@@ -17,7 +17,7 @@ import numpy as np
 
 from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, model_path
+from drakegrasp.dataset.paths import TRIALS_FILE, model_path
 from drakegrasp.dataset.quality import COLUMNS, PARTS, suspicion
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.trials import Trials
@@ -89,7 +89,6 @@ class Snapshot:
         names, classes: Names and classes of the objects, by number.
         trials: The attempts in trials.hdf5.
         table: Columns of the attempts in memory, see `read_attempts`.
-        missing: What is missing, in sentences.
     """
 
     out: Path
@@ -98,7 +97,6 @@ class Snapshot:
     classes: tuple[str, ...]
     trials: Trials
     table: Table
-    missing: tuple[str, ...]
 
     def key(self, i: int) -> AttemptKey:
         """Return the identity of an attempt by its row."""
@@ -150,15 +148,6 @@ def read_snapshot(out: Path) -> Snapshot:
     carried = carried_hand(out, config.hand, str(versions.get("hand", "")))
     names, classes = (tuple(trials.objects[key].tolist()) for key in ("name", "class_name"))
 
-    # What is missing.
-    missing = [
-        f"{name} is not there: no images of camera {camera}."
-        for camera, name in DATA_FILES.items()
-        if not os.path.lexists(out / name)
-    ]
-    gone = [name for name in names if find_model(out, name) is None]
-    if gone:
-        missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
     return Snapshot(
         out=out,
         config=config.with_hand(config.hand, carried),
@@ -166,5 +155,4 @@ def read_snapshot(out: Path) -> Snapshot:
         classes=classes,
         trials=trials,
         table=read_attempts(trials),
-        missing=tuple(missing),
     )

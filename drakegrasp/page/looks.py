@@ -9,7 +9,7 @@ visible as a different pose of the hand.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,6 @@ from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.page.catalog import Snapshot, find_model
-from drakegrasp.pictures.style import HIDDEN
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
 
 #: Maximum number of object meshes in memory.
@@ -108,7 +107,6 @@ def contact_dots(
     snapshot: Snapshot,
     row: dict[str, Any],
     camera: str,
-    look: Look | None = None,
     *,
     contacts: tuple[Array, Array] | None = None,
 ) -> list[Dot]:
@@ -118,8 +116,6 @@ def contact_dots(
         snapshot: State of the files, with the configuration of the cameras.
         row: Row with the columns THUMBNAIL.
         camera: `oto` or `otm`.
-        look: Images of the camera, which show what the object hides; without them nothing is
-            hidden.
         contacts: Points and normals (k, 3) in {O}; those of the row after closing if None.
     """
     # The contacts and the tips of their normals in {C}.
@@ -130,15 +126,7 @@ def contact_dots(
     X_CO = multiply(invert_pose(X_TC), X_TO)
     p_CQ, nhat_Q_C = transform_points(X_CO, p_OQ), rotate_vectors(X_CO, nhat_Q_O)
 
-    def is_hidden(finger: int, u: float, v: float) -> bool:
-        # A contact is hidden if something nearer is seen at its pixel, as on contact sheets.
-        if look is None:
-            return False
-        last = look.image.shape[-1] - 1
-        column, pixel_row = (min(max(round(x), 0), last) for x in (u, v))
-        return float(p_CQ[finger, 2]) > float(look.image[3, pixel_row, column]) + HIDDEN
-
-    return dots_of(intrinsics(config), p_CQ, nhat_Q_C, config.near, is_hidden)
+    return dots_of(intrinsics(config), p_CQ, nhat_Q_C, config.near)
 
 
 def dots_of(
@@ -146,7 +134,7 @@ def dots_of(
     p_CQ: Array,
     nhat_Q_C: Array,
     near: float,
-    is_hidden: Callable[[int, float, float], bool],
+    hidden: Sequence[bool] = (),
 ) -> list[Dot]:
     """Return contacts (k, 3) in {C} as dots, without those that are not beyond the near plane.
 
@@ -155,14 +143,13 @@ def dots_of(
         p_CQ: (k, 3), points [m]; NaN if there is none.
         nhat_Q_C: (k, 3), normals; their tips are at the distance `ARROW`.
         near: Near plane [m].
-        is_hidden: Function of a finger and its pixel u, v that returns whether its contact is
-            hidden.
+        hidden: (k,), whether something hides each contact; by default nothing does.
     """
     p_CE, dots = p_CQ + ARROW * np.nan_to_num(nhat_Q_C), []
     for finger, (point, tip) in enumerate(zip(p_CQ, p_CE, strict=True)):
         if np.isfinite(point).all() and min(point[2], tip[2]) > near:
             (u, v), (tip_u, tip_v) = project(K, np.array([point, tip])).tolist()
-            dots.append(Dot(finger, u, v, tip_u, tip_v, is_hidden(finger, u, v)))
+            dots.append(Dot(finger, u, v, tip_u, tip_v, finger < len(hidden) and hidden[finger]))
     return dots
 
 

@@ -35,12 +35,10 @@ from drakegrasp.page.looks import (
     THUMBNAIL,
     Dot,
     HandView,
-    Look,
     contact_dots,
     contacts_of,
     hand_states,
     make_scene,
-    read_look,
     read_rows,
 )
 from drakegrasp.table import Table
@@ -188,9 +186,8 @@ class Predictions(Gallery):
         verdict, (row,) = self.verdict(i), read_rows(snapshot, [at])
         views = []
         for camera in sorted(CAMERAS, key=lambda name: name != self.rows.camera):
-            look = read_look(snapshot, at, camera)
             strip = f"/strip/{at}-{camera}.png"
-            marks = self._marks(verdict, row, camera, look)
+            marks = self._marks(verdict, row, camera)
             views.append({"camera": camera, "strip": strip, "marks": marks})
 
         return {
@@ -214,16 +211,16 @@ class Predictions(Gallery):
         return [("failed", _outcome(self.table.outcome[i])), *by_another]
 
     def _marks(
-        self, verdict: Mapping[str, Any], row: dict[str, Any], camera: str, look: Look | None = None
+        self, verdict: Mapping[str, Any], row: dict[str, Any], camera: str
     ) -> dict[str, list[Dot]]:
         """Return where a camera sees the contacts of each kind."""
-        marks = {"true": contact_dots(self.snapshot, row, camera, look)}
+        marks = {"true": contact_dots(self.snapshot, row, camera)}
         for kind, names in _CONTACTS.items():
             points, normals = (verdict[name] for name in names)
             there = points is not None and normals is not None
             contacts = (points, normals)
             marks[kind] = (
-                contact_dots(self.snapshot, row, camera, look, contacts=contacts) if there else []
+                contact_dots(self.snapshot, row, camera, contacts=contacts) if there else []
             )
         return marks
 

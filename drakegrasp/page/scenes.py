@@ -139,11 +139,11 @@ class Scenes(Gallery):
             p_CQ, nhat, X_CG = (
                 grasps[name][row].astype(float) for name in ("p_AQ", "nhat_Q_A", "X_AG")
             )
-            visible, near = grasps["visible"][row], self.data.near
-            dots = dots_of(K, p_CQ, nhat, near, lambda finger, u, v: not visible[finger])
+            near = self.data.near
+            dots = dots_of(K, p_CQ, nhat, near, (~grasps["visible"][row]).tolist())
             # The palm is drawn like a contact: a dot with a line.
             along = PALM / ARROW * X_CG[None, :3, 2]
-            palm = dots_of(K, X_CG[None, :3, 3], along, near, lambda finger, u, v: False)
+            palm = dots_of(K, X_CG[None, :3, 3], along, near)
         return {
             "href": f"/view/{i}-{k}.png",
             "size": self.data.image_size,

@@ -9,7 +9,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 from helpers.datasets import (
@@ -24,7 +23,6 @@ from starlette.testclient import TestClient
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
-from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.page.app import HEADERS, TOKEN_HEADER, Inspection, make_app
@@ -289,20 +287,6 @@ def test_a_contact_without_a_normal_is_a_reason(out: Path) -> None:
     assert "normal angle: none" in card
     parts = get(client, "/grasp/0-0-0").text
     assert re.search(r"<th>normal angle</th><td>none</td>", parts)
-
-
-def test_contacts_that_the_object_hides_are_hollow(out: Path) -> None:
-    """As on contact sheets: a depth image with nothing near hides no contact."""
-    before = get(open_pages(out), "/grasp/0-0-0").text.count('class="hidden"')
-    assert before > 0
-    # Without depth nothing is before a contact.
-    for camera in CAMERAS:
-        with h5py.File(out / f"grasping_{camera}.hdf5", "r+") as file:
-            for split in file.values():
-                images = split["images"][:]
-                images[:, 3] = 9.0
-                split["images"][:] = images
-    assert get(open_pages(out), "/grasp/0-0-0").text.count('class="hidden"') == 0
 
 
 def test_broken_rejections_are_refused_at_the_start(out: Path) -> None:
