@@ -220,6 +220,8 @@ class Target:
             counts[name] = found - self._lost[name]
             if found < shares[name]:
                 (spent if item.given_up is None else vain).append(name)
+
+        # The target of all objects together may be reached without those.
         total = sum(counts.values())
         if config.samples is not None and total < config.samples:
             lines.append(f"{total:,} of {config.samples:,} samples were found")

@@ -30,11 +30,11 @@ def test_the_objects_with_most_grasps_are_drawn() -> None:
 
 def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:
     values = np.append(np.linspace(0.0, 1.0, 99), [50.0, np.nan])
-    groups = {"held": np.ones(101, bool), "stable": values < 0.5}
+    groups = {"samples": np.ones(101, bool), "stable": values < 0.5}
     figure = draw_distributions([("slip [mm]", values)], groups, title="101 samples")
     assert figure.legends[0].get_title().get_text() == "101 samples"
-    held, stable = (patch.get_data().values for patch in figure.axes[0].patches)
-    assert held.sum() == 100
+    samples, stable = (patch.get_data().values for patch in figure.axes[0].patches)
+    assert samples.sum() == 100
     assert stable.sum() == (values < 0.5).sum()
     assert figure.axes[0].get_xlim()[1] < 2.0
 
