@@ -12,7 +12,6 @@ import pytest
 import trimesh
 from helpers.builds import build
 from helpers.commands import error_line, run
-from helpers.datasets import edit_manifest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 
@@ -87,11 +86,6 @@ def test_a_trial_is_replayed_to_the_bit(passed_on: Path) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
 
 
-def test_check_finds_nothing(passed_on: Path) -> None:
-    result = run("check", passed_on)
-    assert result.exit_code == 0, result.output
-
-
 def test_its_grasps_are_verified(passed_on: Path) -> None:
     result = run("verify", passed_on / DATA_FILES["oto"], "--split", "train", "--quiet")
     assert result.exit_code == 0, result.stderr
@@ -161,17 +155,3 @@ def test_a_damaged_copy_is_found_refused_and_made_again(copy: Path, tmp_path: Pa
     assert "must hold the hand of the dataset" in error_line(run("replay", copy, "--trial", 0))
     go_on(copy, write_hand(tmp_path / "elsewhere"))
     assert model.read_text() == whole
-
-
-def test_merging_demands_the_same_hand_and_carries_it(
-    passed_on: Path, copy: Path, tmp_path: Path
-) -> None:
-    result = run("merge", tmp_path / "merged", passed_on, copy)
-    assert result.exit_code == 0, result.output
-    assert hand_digest(hand_path(tmp_path / "merged")) == hand_digest(hand_path(passed_on))
-    assert run("check", tmp_path / "merged").exit_code == 0
-
-    edit_manifest(copy, lambda tree: tree["versions"].update(hand="0" * 16))
-    assert run("assemble", copy).exit_code == 0
-    said = error_line(run("merge", tmp_path / "again", passed_on, copy))
-    assert "must be of hand " in said

@@ -316,20 +316,3 @@ def test_blank_image_never_becomes_data(
     assert not shard.exists()
     build(find_meshes(meshes), out, config, run_here, show=False)
     assert_same_dataset(undisturbed, out)
-
-
-@pytest.mark.nightly
-@pytest.mark.cluster
-def test_second_build_is_refused_before_it_starts(
-    meshes: Path, undisturbed: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    begin(out, undisturbed, units=2)
-    first = start_build(meshes, out, workers=1)
-    while not (out / "build.lock").exists():
-        time.sleep(0.05)
-    _, errors = start_build(meshes, out, workers=1).communicate(timeout=60)
-    assert f"must be built by one process at a time, got process {first.pid} on" in errors
-    assert len(errors.splitlines()) == 1
-    finish(first)
-    assert_same_dataset(undisturbed, out)

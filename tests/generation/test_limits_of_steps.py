@@ -20,7 +20,7 @@ from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.runtime.journal import HUNG_DEATHS, PREPARE_DEATHS
+from drakegrasp.runtime.journal import HUNG_DEATHS
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow, pytest.mark.nightly]
 
@@ -89,17 +89,6 @@ def test_mesh_whose_preparing_hangs_is_refused_and_the_other_is_not(
     )
     assert isinstance(prepare_one(innocent)[1], ObjectEntry)
     assert not list(tmp_path.rglob("*.journal"))
-
-
-def test_distances_that_kill_the_process_cost_the_mesh(
-    sources: list[MeshSource], config: Config, tmp_path: Path
-) -> None:
-    """They are measured while the mesh is prepared, so that they stop no build."""
-    guilty, _ = prepare_tasks(sources, tmp_path / "out", config)
-    die(prepare_one, guilty, "exit:1_box_a:distances", PREPARE_DEATHS, seconds=60.0)
-    entry = prepare_one(guilty)[1]
-    assert isinstance(entry, RefusedMesh) and entry.again
-    assert "was at work whenever its process vanished" in entry.reason
 
 
 def test_screen_that_hangs_ends_and_is_named(

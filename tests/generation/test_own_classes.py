@@ -43,9 +43,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own-sampler.md
 #: What samplers may be otherwise, and what is said of them.
 WRONG_SAMPLERS = {
     "syntax": ("class Mine(:", r"mine\.py: must be imported, got SyntaxError \(.*line 1\)"),
-    "import": ("\nimport nothing_like_it", r"must be imported, got ModuleNotFoundError in line 2"),
     "no class": ("Other = 3", r"mine\.py: must have a class Mine, got none"),
-    "no class but a value": ("Mine = 3", r"mine\.py: must have a class Mine, got none"),
     "constructor": (
         "class Mine:\n  def __init__(self, model): pass\n  def poses(self): yield",
         r"mine\.py:Mine: must take \(model, X_TO, stream, config\), got other arguments",
@@ -58,11 +56,8 @@ WRONG_SAMPLERS = {
 #: What a sampler may yield otherwise.
 WRONG_POSES = {
     "shape": ("yield np.eye(3)", r"Mine: pose 0 must be a pose, 4 x 4 .* of shape \(3, 3\)"),
-    "many": ("yield np.tile(np.eye(4), (2, 1, 1))", r"pose 0 must be one pose, .*, got 2 of them"),
     "NaN": ("yield np.eye(4); yield np.nan * np.eye(4)", r"pose 1 must be finite"),
-    "no rotation": ("yield 2 * np.eye(4)", r"pose 0 must have 0 0 0 1 as its last row"),
     "words": ("yield 'up'", r"pose 0 must be a pose, 4 x 4 numbers"),
-    "list": ("yield [np.eye(4), (None, 0.0)]", r"pose 0 must be a pose, 4 x 4 numbers"),
     "no poses": ("return None", r"Mine: must run, got TypeError"),
     "error": (
         "yield 1 / 0",
@@ -76,11 +71,8 @@ WRONG_SHAPES = {
         "barrett",
         r"pose 1 must have a shape \(preshape, spread in rad\), got float",
     ),
-    "no spread": ("('pinch',)", "barrett", r"have a shape \(preshape, spread in rad\), got tuple"),
     "degrees": ("(None, 22.5)", "barrett", r"pose 1: spread must be 0 to 3\.14 rad .*, got 22\.5$"),
     "NaN": ("(None, np.nan)", "barrett", r"spread must be 0 to 3\.14 rad .* barrett, got nan$"),
-    "word": ("(None, 'wide')", "barrett", r"spread must be 0 to 3\.14 rad .*, got 'wide'$"),
-    "no spread joints": ("(None, 0.2)", "franka", r"spread must be 0 to 0 rad .*, got 0\.2$"),
     "no preshapes": ("('pinch', 0)", "barrett", r"preshape must be None .* barrett, got 'pinch'$"),
     "other preshape": (
         "('pinch', 0)",
@@ -88,8 +80,6 @@ WRONG_SHAPES = {
         r"preshape must be one of tripod, envelope, or its index, for the hand .*, got 'pinch'$",
     ),
     "no preshape": ("(None, 0)", "allegro_four", r"preshape must be one of .*, got None$"),
-    "large index": ("(2, 0)", "allegro_four", r"preshape must be one of .*, got 2$"),
-    "array": ("(np.eye(3), 0)", "allegro_four", r"preshape must be one of .*, got array\("),
 }
 #: What a filter may return otherwise.
 WRONG_FILTERS = {

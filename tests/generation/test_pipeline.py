@@ -24,7 +24,7 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.dataset.statistics import count_funnel
-from drakegrasp.errors import ConfigError, DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.generation.prepare import prepare_one
@@ -261,29 +261,6 @@ def test_replay_says_what_differs(out: Path) -> None:
     assert again.differences["spread"] == again.differences["outcome"] == pytest.approx(1.0)
     with pytest.raises(DataError, match="trial must be 0 to 143, got 144"):
         replay_trial(out, 144)
-
-
-@pytest.mark.cluster
-def test_scheduler_that_is_not_there_is_named(
-    tmp_path: Path, small_meshes: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("CONNECT_SECONDS", "WRITE_SECONDS"):
-        monkeypatch.setattr(f"drakegrasp.cluster.connect.{name}", 0.2)
-    with pytest.raises(MachineError, match="must be a running Dask scheduler"):
-        build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9", tls=False)
-    with pytest.raises(ConfigError, match=r"begins with tls://, got tcp://127\.0\.0\.1:9: anybody"):
-        build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
-    file = tmp_path / "open.json"
-    file.write_text('{"address": "tcp://127.0.0.1:9"}')
-    with pytest.raises(ConfigError, match="begins with tls://, got tcp"):
-        build_dataset(small_meshes, tmp_path / "out", scheduler_file=file)
-    with pytest.raises(MachineError, match=r"none\.json: must be the file of a running Dask"):
-        build_dataset(small_meshes, tmp_path / "out", scheduler_file=tmp_path / "none.json")
-    for number, text in enumerate(("", "x", "{}", "[]", '{"address": 5}')):
-        file = tmp_path / f"{number}.json"
-        file.write_text(text)
-        with pytest.raises(MachineError, match=r"\d\.json: must be the file of a running Dask"):
-            build_dataset(small_meshes, tmp_path / "out", scheduler_file=file)
 
 
 def test_repeats_come_with_the_samples_and_change_none(

@@ -15,11 +15,10 @@ from helpers.builds import build
 from helpers.meshes import write_fixed
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
-from drakegrasp.hand.settings import load_config, override_config
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
@@ -124,25 +123,3 @@ def test_lifts_are_tried_elsewhere_as_they_lay(
     ids = [lift["trial_id"] for lift in lifts]
     assert len(np.unique(columns["resting"][ids])) > 1
     np.testing.assert_array_equal(stood, [unpack_pose(columns["X_TO"][i]) for i in ids])
-
-
-def test_target_is_met_and_extended(
-    dataset: Path, sources: list[MeshSource], config: Config, tmp_path: Path
-) -> None:
-    # All units are done; the target says which of them belong to the dataset.
-    out = tmp_path / "out"
-    shutil.copytree(dataset, out)
-    few = override_config(config, ["samples=2"])
-    build(sources, out, few, run_here, show=False)
-    assert [str(v) for v in check_dataset(out)] == []
-    with h5py.File(out / "trials.hdf5") as file:
-        before = {row.tobytes() for row in file["trials/X_OG"][:]}
-    assert len(before) < len(trials(dataset)["outcome"])
-
-    # More than there can be: all palm poses are tried.
-    most = override_config(config, ["samples=1000", "samples_patience=1000"])
-    assert build(sources, out, most, run_here, show=False).simulated == 0
-    columns = trials(out)
-    for name, values in trials(dataset).items():
-        np.testing.assert_array_equal(columns[name], values)
-    assert before <= {row.tobytes() for row in columns["X_OG"]}

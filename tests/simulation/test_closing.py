@@ -110,18 +110,6 @@ def test_jaws_with_one_motor_stop_together(shared: Hand) -> None:
     np.testing.assert_allclose(found["gaps"], [[0.004, 0.0]], atol=BLUR)
 
 
-def test_a_hand_within_object_or_table_is_not_free(jaws: Hand) -> None:
-    """A palm in the box; and tips 1 cm below the table, beside the box."""
-    X_TG = np.stack([down(z=0.05), down(x=0.2, z=TIPS - 0.01), down()])
-    found = close_on(solid(box()), jaws, 0.0, X_TG)
-    assert found["free"].tolist() == [False, False, True]
-    assert (found["score"] > 0.0).tolist() == [False, False, True]
-    assert found["clearance"][0] < -0.01 < 0.0 < found["clearance"][1]
-    np.testing.assert_allclose(found["table"], [0.05 - TIPS, -0.01, HEIGHT - TIPS], atol=1e-6)
-    # The table stops the jaws, too.
-    assert found["closed"][1].tolist() == [0.0, 0.0]
-
-
 def test_a_hand_may_begin_to_close_from_other_positions(jaws: Hand) -> None:
     """At 10 mm it still stops at the faces; at 25 mm the jaws are 5 mm within the box."""
     starts = np.array([[0.01, 0.01], [0.025, 0.025]])

@@ -18,7 +18,6 @@ from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.construction import build_scene
@@ -40,15 +39,10 @@ from drakegrasp.simulation.scene import (
     start_limits,
     transfer_state,
 )
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import run_attempt
 
 #: Rounding and the compliance of Drake's joint limits [rad].
 STILL = np.deg2rad(0.02)
-
-
-def test_configuration_overrides_the_drive_of_the_hand(config: Config, hand: Hand) -> None:
-    assert drive_of(hand, config.lift) == "worm"
-    assert drive_of(hand, override_config(config, ["lift.drive=torque"]).lift) == "torque"
 
 
 def test_worm_needs_a_holding_torque(config: Config, tmp_path: Path) -> None:
@@ -72,30 +66,6 @@ def test_attempt_with_an_impossible_drive_is_refused(
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
     return box_model(tmp_path_factory.mktemp("carton"), [0.06, 0.06, 0.10])
-
-
-@pytest.fixture(scope="module")
-def pinch(carton: ObjectModel, config: Config, hand: Hand) -> dict[str, TrialRecord]:
-    """The carton, pinched symmetrically from above, by drive."""
-    scene = build_scene(carton, config.physics, hand)
-    return {
-        drive: run_attempt(
-            scene,
-            standing(carton),
-            from_above(carton, STANDOFF),
-            override_config(config, [f"lift.drive={drive}"]),
-        )
-        for drive in ("worm", "torque", "locked")
-    }
-
-
-@pytest.mark.sim
-@pytest.mark.parametrize("drive", ["worm", "locked"])
-def test_pinched_carton_stays_where_it_is(pinch: dict[str, TrialRecord], drive: str) -> None:
-    held = pinch[drive]
-    assert held.outcome is Outcome.SUCCESS
-    assert held.lift.slip < 1e-3
-    assert held.lift.turn < np.deg2rad(1.0)
 
 
 @pytest.mark.sim

@@ -17,7 +17,6 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation import scene_cache
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene_cache import (
-    DIAGRAMS,
     cached_renderer,
     cached_scene,
     forget_scenes,
@@ -83,11 +82,3 @@ def test_object_on_the_diagram_of_another_gives_the_bits_of_a_scene_of_its_own(
     )
     assert expected.lift is not None
     assert pickle.dumps(found) == pickle.dumps(expected)
-
-
-def test_few_diagrams_are_kept_and_scenes_go_with_theirs(cube: ObjectModel, config: Config) -> None:
-    for contact_force in np.linspace(0.1, 0.2, DIAGRAMS + 1).tolist():
-        physics = config.physics.model_copy(update={"contact_force": contact_force})
-        cached_scene(cube, physics, config.hand)
-    plants = {id(scene.plant) for scene in scene_cache._kept.values()}
-    assert len(plants) == len(scene_cache._diagrams) == DIAGRAMS

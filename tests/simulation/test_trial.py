@@ -10,7 +10,6 @@ import pytest
 from helpers.objects import (
     CUBE,
     STANDOFF,
-    box_model,
     from_above,
     standing,
 )
@@ -21,7 +20,6 @@ from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation import scene as stepping
 from drakegrasp.simulation.construction import (
-    build_object_scene,
     build_scene,
 )
 from drakegrasp.simulation.lift import lift_duration
@@ -31,7 +29,6 @@ from drakegrasp.simulation.scene import (
     palm_pose,
     release,
     reset_attempt,
-    reset_object,
 )
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
@@ -154,16 +151,6 @@ def test_error_within_drake_is_an_outcome_and_one_of_the_machine_is_not(
     assert record.outcome.stage is Stage.PLACED
 
 
-@pytest.mark.parametrize("mode", ["on", "off"])
-def test_hand_wholly_inside_of_an_object_collides(tmp_path, config, hand, mode):
-    """No surfaces cross there: only the inside test can see it, that of the screen or the scene."""
-    block = box_model(tmp_path, [0.6, 0.6, 0.6])
-    attempt = replace(from_above(block, 0.0), X_OG=make_pose(np.eye(3), [0.0, 0.0, 0.0]))
-    rules = override_config(config, [f"screen.mode={mode}"])
-    scene = build_scene(block, config.physics, hand)
-    assert run_attempt(scene, standing(block), attempt, rules).outcome is Outcome.START_COLLISION
-
-
 def test_same_attempt_gives_the_same_bits_whatever_ran_before(scene, cube, config, hand, held):
     run_attempt(scene, standing(cube), from_above(cube, 0.05, spread=0.3), config)
     again = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
@@ -201,35 +188,6 @@ def test_lift_keeps_its_speed_and_acceleration_limits(scene, cube, config):
     assert np.abs(speed).max() <= 1.02 * config.lift.max_speed
     assert np.abs(np.diff(speed) / step).max() <= 1.05 * config.lift.max_acceleration
     assert heights[-1] == pytest.approx(target[2], abs=1e-4)
-
-
-def test_table_friction_stops_a_sliding_block(tmp_path):
-    """A block of speed v slides v^2 / (2 mu g) before it stops.
-
-    The table is stiff: at 1 ms the distance is two tenths short, at 0.2 ms less than one.
-    """
-    model = box_model(tmp_path, [0.08, 0.08, 0.04])
-    physics = load_config(
-        overrides=["physics.friction_table=0.5", "physics.time_step=0.0002"]
-    ).physics
-    slid = {}
-    for start, x in ((0.5, 0.0), (0.5, 0.3), (1.0, 0.0)):
-        scene = build_object_scene(model, physics)
-        X_WO = X_WT @ standing(model)
-        X_WO[0, 3] += x
-        reset_object(scene, X_WO)
-        scene.simulator.Initialize()
-        advance(scene, 0.1)
-        velocity = np.zeros(6)
-        velocity[3] = start
-        scene.plant.SetVelocities(scene.context, velocity)
-        before = scene.pose(scene.object)[0, 3]
-        advance(scene, 0.3)
-        assert np.abs(scene.plant.GetVelocities(scene.context)).max() < 1e-3
-        slid[start, x] = scene.pose(scene.object)[0, 3] - before
-        assert slid[start, x] == pytest.approx(start**2 / (2.0 * 0.5 * GRAVITY), rel=0.1)
-    # No border of the table's parts is where objects stand.
-    assert slid[0.5, 0.3] == pytest.approx(slid[0.5, 0.0], rel=1e-3)
 
 
 # Each verdict of a trial, by the one contact that decides it

@@ -96,15 +96,6 @@ def test_sample_is_lost_beyond_either_limit_where_that_ends_lifts(
         assert is_lost_sample(slip, turn, rules) == ends
 
 
-def test_a_fingertip_that_is_not_required_may_miss() -> None:
-    """The second of three."""
-    touching, required = [[True, False, True], [False, True, True]], [True, False, True]
-    closed = judge_closed(touching, [0, 0], [False, False], required=required)
-    assert closed.tolist() == [Outcome.SUCCESS, Outcome.MISSING_FINGERTIP]
-    lifted = judge_lifted(touching, [0, 0], [False, False], required=required)
-    assert lifted.tolist() == [Outcome.SUCCESS, Outcome.PARTLY_HELD]
-
-
 def test_hand_that_scraped_the_table_is_refused_last() -> None:
     """Where nothing else refuses it; one that was not measured is not refused."""
     rules = CloseConfig(scrape_depth=5e-4)
