@@ -12,7 +12,7 @@ from cyclopts import Parameter
 import drakegrasp as dg
 from drakegrasp.cli.arguments import AsJson, Count, Dataset, File, Folder, NewFile, Settings
 from drakegrasp.cli.console import processes, progress_bar, say, say_json
-from drakegrasp.errors import counted, printable
+from drakegrasp.errors import counted
 
 
 def assemble(
@@ -175,8 +175,6 @@ def replay(
     # All differences are printed: values first, then versions, which may explain them.
     again = dg.replay_trial(out, trial)
     say(f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}")
-    for other, links in again.meetings.items():
-        say(f"  where it starts, {', '.join(map(printable, links))} of the hand meet the {other}")
     for name, difference in again.differences.items():
         how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
         say(f"  {name} differs: {how}")

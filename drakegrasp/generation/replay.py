@@ -25,7 +25,6 @@ from drakegrasp.pictures.recording import record_attempt
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.trial import start_meetings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +38,6 @@ class Replay:
         found: Outcome of the replay.
         differences: Largest absolute difference of each field whose values differ.
         versions: Packages whose versions differ, with values "then -> now".
-        meetings: For a start collision, the links of the hand that touch the object or the table
-            at the start, by the keys "object" and "table".
     """
 
     trial_id: int
@@ -49,7 +46,6 @@ class Replay:
     found: Outcome
     differences: dict[str, float]
     versions: dict[str, str]
-    meetings: dict[str, list[str]]
 
     @property
     def same(self) -> bool:
@@ -75,11 +71,6 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     record = try_attempt(setup, attempt)
     row = trial_rows(setup, [attempt], [record])
 
-    # Find what the hand touches in a start collision.
-    meetings = {}
-    if record.outcome is Outcome.START_COLLISION:
-        meetings = start_meetings(setup.scene_of(attempt), record.X_TO, attempt)
-
     # Compare bit for bit; other versions may explain a difference.
     then, now = read_manifest(Path(out)).versions, installed_versions(config)
     pairs = {f.name: (stored[f.name], row[f.name][0]) for f in trial_columns() if f.name in row}
@@ -98,7 +89,6 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
             for key, known in then.items()
             if now.get(key) != known
         },
-        meetings=meetings,
     )
 
 
