@@ -2,7 +2,9 @@
 
 Input: a path and the configuration of a build. Output: while the block runs, a directory that this
 process holds, that contains the hand, and whose manifest the build completes. A directory that
-cannot be used is rejected before any worker starts.
+cannot be used is rejected before any worker starts. `DatasetTask` is what the tasks of a build have
+in common: plain data, and the files of the directory that they use. A worker that does not see the
+directory gets copies of these files, see `FileTask` of `drakegrasp.runtime.executor`.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.lock import build_lock
@@ -21,10 +24,10 @@ from drakegrasp.dataset.manifest import (
     package_versions,
     release_directory,
 )
-from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.paths import FILE_NAME, places
 from drakegrasp.errors import DataError, counted, listed
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.folder import carry_hand
+from drakegrasp.hand.folder import carry_hand, hand_places, moved_hand
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 
@@ -112,3 +115,38 @@ def _refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
             f"{out}: must be given every mesh that it was built from, got none named "
             f"{missing[0]}; choose another --out"
         )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DatasetTask:
+    """The input of a task on files of a dataset, as plain data.
+
+    Attributes:
+        out: Directory of the dataset, as a path of the process that runs the task.
+        config: Configuration of the dataset.
+    """
+
+    out: Path
+    config: Config
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files of the dataset that the task reads, without those of the hand."""
+        raise NotImplementedError
+
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """Files of the dataset that the task writes or removes."""
+        raise NotImplementedError
+
+    def reads(self) -> dict[str, Path]:
+        """Return the files that the task reads by their places, see `FileTask`."""
+        return {**hand_places(self.config), **places(self.out, *self.inputs)}
+
+    def writes(self) -> tuple[str, ...]:
+        """Return the places of the files that the task writes or removes."""
+        return tuple(path.relative_to(self.out).as_posix() for path in self.outputs)
+
+    def moved(self, folder: Path) -> Self:
+        """Return the task in a directory with copies of the files."""
+        return replace(self, out=folder, config=moved_hand(self.config, folder))

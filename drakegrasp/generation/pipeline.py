@@ -159,6 +159,7 @@ class _Build:
         """Prepare, simulate, assemble."""
         # Write the manifest first, because a directory without a manifest holds no dataset.
         write_manifest(self._manifest, self._out)
+
         # Prepare each object, or reject its mesh.
         with self._progress("prepare", "objects") as report:
             self._prepare(sources, report)

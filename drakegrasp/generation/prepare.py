@@ -19,7 +19,7 @@ from drakegrasp.dataset.paths import model_path, object_files
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import MachineError, MeshError
 from drakegrasp.frames import Array
-from drakegrasp.generation.tasks import DatasetTask
+from drakegrasp.generation.directory import DatasetTask
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource, read_source
 from drakegrasp.runtime.environment import one_thread, release_memory

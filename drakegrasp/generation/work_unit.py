@@ -37,7 +37,7 @@ from drakegrasp.generation.attempts import (
     trial_setup,
     try_attempt,
 )
-from drakegrasp.generation.tasks import DatasetTask
+from drakegrasp.generation.directory import DatasetTask
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, trim_memory
 from drakegrasp.runtime.files import disk_full_named
