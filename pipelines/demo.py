@@ -17,7 +17,7 @@ from drakegrasp.config import BuiltinConfig
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.hand.settings import load_config
-from drakegrasp.pictures.sheets import sample_sheet
+from drakegrasp.pictures.figures import sample_sheet
 from drakegrasp.pictures.style import save_figure
 from drakegrasp.shapes.catalog import draw_builtin, export_builtin
 

@@ -28,7 +28,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import MachineError
-from drakegrasp.generation.counts import Counts
+from drakegrasp.generation.pipeline import Counts
 from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome

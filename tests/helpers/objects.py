@@ -14,8 +14,7 @@ from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.candidates import Drawing, palm_attempts
-from drakegrasp.simulation.samplers import R_OG0
+from drakegrasp.simulation.candidates import R_OG0, Drawing, palm_attempts
 
 #: Edge of the cube that the hand can grasp from above [m].
 CUBE = 0.07
@@ -76,7 +75,7 @@ def write_above(folder: Path, standoff: float, x: float = 0.0) -> str:
     path = folder / "above.py"
     path.write_text(
         "from drakegrasp.frames import make_pose\n"
-        "from drakegrasp.simulation.samplers import R_OG0\n"
+        "from drakegrasp.simulation.candidates import R_OG0\n"
         "class Above:\n"
         "  def __init__(self, model, X_TO, stream, config):\n"
         f"    self.height = float(model.half_extents[2]) + {standoff}\n"

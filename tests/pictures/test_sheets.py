@@ -23,7 +23,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.pictures import sheets
-from drakegrasp.pictures.sheets import (
+from drakegrasp.pictures.figures import (
     draw_sheet,
     sample_sheet,
     spread_over_objects,
@@ -184,7 +184,7 @@ def test_figures_import_no_drake() -> None:
     import subprocess
 
     code = (
-        "import sys, drakegrasp.pictures.sheets; "
+        "import sys, drakegrasp.pictures.figures; "
         "print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
     )
     found = subprocess.run(

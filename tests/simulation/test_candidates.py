@@ -23,8 +23,9 @@ from drakegrasp.simulation.candidates import (
     Drawing,
     palm_attempts,
     palm_ray_distance,
+    ray_meets_box,
+    rotation_candidates,
 )
-from drakegrasp.simulation.samplers import ray_meets_box, rotation_candidates
 
 #: Full extents of three of the paper's meshes [m]; their files are in centimetres. Counts
 #: of valid and of distinct poses.

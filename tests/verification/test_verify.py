@@ -19,9 +19,9 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.candidates import R_OG0
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.samplers import R_OG0
 from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 from drakegrasp.verification import verify as verifying
 from drakegrasp.verification.placing import place_on_object
