@@ -64,7 +64,6 @@ def figures(
 
         sheet          colour, depth and mask of samples of all objects in turn
         outcomes       how the attempts ended: samples, removed, failed
-        objects        samples of each object, and how many are distinct
         distributions  slip, turn, forces of the samples
 
     Args:

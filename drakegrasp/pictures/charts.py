@@ -26,8 +26,6 @@ GROUPS = {
     "stable": "#009E73",
 }
 FAILED = "#9AA0A8"
-#: Maximum number of objects in a plot, which are those with the most grasps.
-MAX_OBJECTS = 60
 #: Bins of a histogram, and the fraction of the values that determines its range, since a few
 #: extreme values would squeeze the others.
 BINS, SHOWN = 40, 0.98
@@ -60,35 +58,6 @@ def draw_counts(counts: Mapping[str, int], what: str, *, title: str = "") -> Fig
     axes.set_xscale("log")
     axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
     axes.set_xlabel(what)
-    return figure
-
-
-def draw_objects(
-    names: Sequence[str], counts: Mapping[str, Sequence[int]], *, title: str = ""
-) -> Figure:
-    """Return a chart of the number of grasps of each object.
-
-    Args:
-        names: Names of the objects.
-        counts: Number of grasps of each object by the names of GROUPS, the largest group first;
-            each group is a part of the previous one.
-        title: What the figure counts; none if empty.
-    """
-    # The objects with the most grasps, the largest on top.
-    most = np.array(next(iter(counts.values())), dtype=int)
-    order = np.argsort(-most, kind="stable")[:MAX_OBJECTS]
-    figure = Figure(figsize=(8.0, 1.1 + 0.22 * max(len(order), 1)), layout="constrained")
-    axes = figure.add_subplot()
-
-    # Bars over one another: each group is a part of the previous one.
-    for group, each in counts.items():
-        numbers = np.array(each, dtype=int)[order]
-        axes.barh(range(len(order)), numbers, color=GROUPS[group], height=0.78, label=group)
-    _name_bars(axes, [names[i] for i in order])
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
-    axes.set_xlabel("grasps")
-    told = "\n".join(filter(None, (title, _left_out(names))))
-    figure.legend(loc="outside upper center", ncols=3, frameon=False, labelcolor=INK, title=told)
     return figure
 
 
@@ -155,12 +124,6 @@ def _plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(color=INK, labelcolor=INK, labelsize=9)
     axes.xaxis.label.set_color(INK)
-
-
-def _left_out(names: Sequence[str]) -> str | None:
-    """Return how many objects a plot leaves out, in words."""
-    more = len(names) - MAX_OBJECTS
-    return f"{more:,} objects with fewer are left out" if more > 0 else None
 
 
 def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:

@@ -34,7 +34,6 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.charts import (
     draw_counts,
     draw_distributions,
-    draw_objects,
 )
 from drakegrasp.pictures.style import (
     INK,
@@ -57,15 +56,7 @@ DPI = 150
 NUMBERS_FILE = "figures.json"
 #: Columns from which `Samples` are computed.
 COLUMNS = (
-    *(
-        "object",
-        "slip",
-        "turn",
-        "closed_f_Q_O",
-        "lifted_f_Q_O",
-        "lifted_penetration",
-        "normal_angle",
-    ),
+    *("slip", "turn", "closed_f_Q_O", "lifted_f_Q_O", "lifted_penetration", "normal_angle"),
     *("precision", "stable"),
 )
 #: Why a figure of samples is left out.
@@ -94,13 +85,11 @@ class Samples(NamedTuple):
 
     Attributes:
         trial_ids: (n,), rows of `/trials`.
-        objects: (n,), rows of `/objects`.
         groups: (n,) bool each, by `samples`, `precision` and `stable`.
         quantities: (n,) each, by title with unit.
     """
 
     trial_ids: npt.NDArray[np.int64]
-    objects: npt.NDArray[np.int64]
     groups: dict[str, npt.NDArray[Any]]
     quantities: dict[str, Array]
 
@@ -130,7 +119,6 @@ def write_figures(
     drawings: dict[str, Callable[[], Drawn]] = {
         "sheet": lambda: _sheet(out),
         "outcomes": lambda: _outcomes(funnel),
-        "objects": lambda: _objects(samples, funnel),
         "distributions": lambda: _distributions(samples, funnel),
     }
     known = {*drawings}
@@ -171,7 +159,6 @@ def read_samples(out: Path) -> Samples:
     angles = np.nan_to_num(columns["normal_angle"])
     return Samples(
         trial_ids=samples.trial_ids,
-        objects=columns["object"].astype(np.int64),
         groups={
             "samples": np.ones(len(samples), dtype=np.bool_),
             "precision": columns["precision"],
@@ -227,18 +214,6 @@ def _outcomes(funnel: Funnel) -> Drawn:
     numbers |= {name: n for name, n in sorted(lost.items(), key=lambda each: -each[1]) if n}
     title = f"{counted(int(outcomes.sum()), 'attempt')} of {counted(len(funnel.names), 'object')}"
     return draw_counts(numbers, "attempts", title=title), numbers
-
-
-def _objects(samples: Samples, funnel: Funnel) -> Drawn:
-    size = len(funnel.names)
-    counts = {"attempts": funnel.outcomes.sum(axis=1)}
-    for name, group in samples.groups.items():
-        counts[name] = np.bincount(samples.objects[group], minlength=size)
-    counts["distinct"] = funnel.distinct
-    rows = zip(funnel.names, zip(*(v.tolist() for v in counts.values()), strict=True), strict=True)
-    numbers = {name: dict(zip(counts, row, strict=True)) for name, row in rows}
-    shown = {name: counts[name].tolist() for name in ("samples", "distinct")}
-    return draw_objects(funnel.names, shown, title=_told(funnel)), numbers
 
 
 def _distributions(samples: Samples, funnel: Funnel) -> Drawn:

@@ -141,10 +141,7 @@ def test_samples_are_as_many_wherever_they_are_counted(
     assert card["all"]["samples"] == total
     write_figures(out, tmp_path / "figures")
     numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
-    assert {name: row["samples"] for name, row in numbers["objects"].items()} == found
     assert numbers["outcomes"]["samples"] == total
-    distinct = sum(row.distinct for row in count_splits(out))
-    assert sum(row["distinct"] for row in numbers["objects"].values()) == distinct
     assert np.count_nonzero(read_snapshot(out).table.split != NONE) == total
 
 

@@ -10,22 +10,10 @@ import pytest
 from matplotlib.image import imread
 
 from drakegrasp.pictures.charts import (
-    MAX_OBJECTS,
     card_picture,
     draw_distributions,
-    draw_objects,
 )
-from drakegrasp.pictures.style import MASK, NO_DEPTH, strip_png, svg_bytes
-
-
-def test_the_objects_with_most_grasps_are_drawn() -> None:
-    number = MAX_OBJECTS + 7
-    counts = {name: list(range(number)) for name in ("samples", "distinct")}
-    figure = draw_objects([f"object {i}" for i in range(number)], counts)
-    labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
-    assert len(labels) == MAX_OBJECTS
-    assert labels[0] == f"object {number - 1}"
-    assert b"<svg" in svg_bytes(figure, dpi=72)
+from drakegrasp.pictures.style import MASK, NO_DEPTH, strip_png
 
 
 def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:

@@ -20,7 +20,7 @@ from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.figures import NUMBERS_FILE, read_samples, write_figures
 
-ALL = {"sheet", "outcomes", "objects", "distributions"}
+ALL = {"sheet", "outcomes", "distributions"}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -69,7 +69,7 @@ def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None
     for name in ("distributions.png", "sheet.svg", "mine.png"):
         (folder / name).touch()
     written = write_figures(out, folder)
-    assert set(written.names) == {"outcomes", "objects"}
+    assert set(written.names) == {"outcomes"}
     assert written.left_out["distributions"] == "no attempt became a sample"
     assert OTO in written.left_out["sheet"]
     # A picture of what was there before is removed, and nothing else.
@@ -90,8 +90,6 @@ def test_pictures_of_samples_count_the_same_rows(sound: Path, tmp_path: Path) ->
     assert numbers["outcomes"]["samples"] == 7
     assert numbers["outcomes"]["removed: rejected"] == 2
     assert sum(numbers["outcomes"].values()) == 36
-    samples = [each["samples"] for each in numbers["objects"].values()]
-    assert (samples.count(2), sum(samples)) == (2, 7)
     assert sorted(numbers["sheet"]["trial_ids"]) == [3, 11, 15, 23, 24, 27, 35]
 
 
@@ -104,13 +102,11 @@ def test_names_are_drawn_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert set(written.names) == ALL
     for svg in (tmp_path / "figures").glob("*.svg"):
         assert b"<script" not in svg.read_bytes()
-    assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
 
 
 def test_every_sample_is_read_once(sound: Path) -> None:
     held = read_samples(sound)
     assert held.trial_ids.tolist() == [0, 3, 11, 12, 15, 23, 24, 27, 35]
-    assert held.objects.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
     assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
     np.testing.assert_allclose(held.quantities["slip in the hand [mm]"], 1e3 * SLIP)
     np.testing.assert_allclose(held.quantities["turn in the hand [°]"], 1.0)
