@@ -4,8 +4,7 @@ Input: a dataset. Output: `<object>.obj` for each object, `objects.yaml` with th
 `rows_<split>.csv` with one line per sample. From this folder `build --objects` builds the same
 objects. The frame of such a mesh file is {O}, so a pose that a network predicts in it is in {O}:
 `score` reads it with `--frame object`, and `verify --object` with any frame. The columns of the
-tables have the names of files of postures, so a table becomes a file of postures when the columns
-of a palm pose are added.
+tables have the names of the arrays of postures.
 """
 
 from __future__ import annotations

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.columns import read_numbers
-from drakegrasp.exchange.contacts import read_contacts
+from drakegrasp.exchange.columns import read_contacts, read_numbers
 
 NUMBERS = np.random.default_rng(0).normal(size=(4, 18)).round(6)
 
@@ -157,7 +156,7 @@ def _absurd(path):
     [
         (_missing, r"grasps\.npy: must be a file of grasps, got none"),
         (_folder, r"grasps\.h5: must be a file of grasps, got none"),
-        (_other_suffix, r"must be a file \.npy, \.h5, \.hdf5, \.csv or \.parquet, got '\.txt'"),
+        (_other_suffix, r"must be a file \.npy, \.h5, \.hdf5 or \.csv, got '\.txt'"),
         (_of("a.npy", b""), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_of("a.npy", b"PK\x03\x04 zip"), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_cut_off, "must be a .npy file of numbers, got none"),
