@@ -54,7 +54,7 @@ def assemble(
     for sentence in unused_rejections(out, rejected, manifest.rejected):
         say(sentence)
     for changed in check_hand(manifest):
-        say(f"{changed}; the card leaves out its drive, load limit and licence")
+        say(str(changed))
 
 
 def scenes(
@@ -140,7 +140,7 @@ def stats(out: Dataset, /, *, as_json: AsJson = False) -> None:
 
 
 def check(
-    path: Annotated[Dataset, Parameter(name="OUT|FILE")],
+    out: Dataset,
     /,
     *,
     workers: Count | None = None,
@@ -151,19 +151,19 @@ def check(
     The exit code is 1 if an invariant is broken.
 
     Args:
-        path: Directory of a dataset, or one of its HDF5 files.
+        out: Directory of the dataset.
         workers: Number of processes on this machine. [default: one per core]
         as_json: Print one document of JSON instead of text.
     """
     with processes(workers, "check", "steps") as how:
-        violations = dg.check_dataset(path, **how)
+        violations = dg.check_dataset(out, **how)
     if as_json:
-        say_json({"path": str(path), "broken": [asdict(violation) for violation in violations]})
+        say_json({"path": str(out), "broken": [asdict(violation) for violation in violations]})
     else:
         for violation in violations:
             say(str(violation))
         found = counted(len(violations), "broken invariant")
-        say(f"{path}: {found if violations else 'no broken invariants'}")
+        say(f"{out}: {found if violations else 'no broken invariants'}")
     if violations:
         sys.exit(1)
 

@@ -1,8 +1,8 @@
-"""From shards to trials.hdf5, grasping_oto.hdf5, grasping_otm.hdf5 and their data card.
+"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
 
-Input: a directory whose work units are all done. Output: the three files, all or none, and their
-card. `assembly.survey` reads the successes and decides which become samples; then the rows go from
-the shards into the files, some thousand at a time. This process keeps a few numbers per success,
+Input: a directory whose work units are all done. Output: the three files, all or none.
+`assembly.survey` reads the successes and decides which become samples; then the rows go from the
+shards into the files, some thousand at a time. This process keeps a few numbers per success,
 whatever the number of attempts. It does not import Drake.
 """
 
@@ -24,7 +24,6 @@ import numpy as np
 
 from drakegrasp.dataset.assembly.samples import IMAGES, sample_values
 from drakegrasp.dataset.assembly.survey import Decisions, ShardRows, Survey, decide, keys_of, survey
-from drakegrasp.dataset.card import card_files, content_of
 from drakegrasp.dataset.hdf5 import (
     COLUMN_CHUNK,
     AnyArray,
@@ -128,7 +127,7 @@ def assemble_locked(
     surveyed: Survey | None = None,
     progress: Report = silent,
 ) -> Assembly:
-    """Write the three files, their card and the manifest; the caller holds the lock.
+    """Write the three files and the manifest; the caller holds the lock.
 
     Args:
         out: Directory of the dataset.
@@ -166,11 +165,7 @@ def assemble_locked(
             _write_table(files[""], "successes", SUCCESS_FIELDS, successes)
             _write_rows(out, decisions, files, progress)
 
-        # The card describes the files in words and numbers. The manifest, with filters, split and
-        # rejections, changes together with the files.
-        content = content_of(manifest, paths[""], paths["oto"])
-        for name, text in card_files(content).items():
-            new(name).write_bytes(text)
+        # The manifest, with filters, split and rejections, changes together with the files.
         new(FILE_NAME).write_bytes(manifest_text(manifest))
     return summarise(out)
 

@@ -18,8 +18,6 @@ SCENES_FILE = "scenes.hdf5"
 FILE_NAME = "manifest.json"
 #: Files that `assemble` writes; they always belong to one state.
 ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
-#: Data cards that describe the dataset, for programs and for people.
-CARD_FILES = ("DATACARD.json", "DATACARD.md")
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
 #: File in this folder in which the frozen benchmark describes itself.

@@ -22,7 +22,6 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, known_homes, survey
-from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.lock import BuildLog
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -498,8 +497,6 @@ class _Build:
                 if surveyed is None and self._successes:
                     surveyed = survey(out, self._manifest, self._successes, progress=report)
                 assemble_locked(out, self._manifest, surveyed=surveyed, progress=report)
-        else:
-            write_card(out)  # the licence of a mesh may have changed
         scenes = self._config.scenes.when == "assembled"
         if scenes and (stale or not (out / SCENES_FILE).is_file()):
             with self._progress("scenes", "objects") as report:

@@ -21,7 +21,6 @@ from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.split import home_by_rank, may_train, rank_in_split
 from drakegrasp.dataset.assembly.survey import known_homes
-from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, packed_chunk, write_field
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
@@ -136,9 +135,7 @@ def make_scenes_locked(
             progress(done, count)
         for group, parts in tables.items():
             _write_table(file, group, parts)
-        counts = count_scenes(file)
-    write_card(out)
-    return counts
+        return count_scenes(file)
 
 
 def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:

@@ -46,7 +46,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "stats": ("stats", "{out}"),
     "assemble": ("assemble", "{out}", "--workers", "1"),
     "check": ("check", "{out}", "--workers", "1"),
-    "check FILE": ("check", "{out}/{file}", "--workers", "1"),
     "replay": ("replay", "{out}", "--trial", "0"),
     "figures": ("figures", "{out}", "--out", "{to}/figures", "--quiet"),
     "inspect": ("inspect", "{out}", "--port", "0", "--no-browser"),
@@ -215,14 +214,14 @@ FILES: dict[str, tuple[Sequence[Kind], tuple[str, ...]]] = {
     TRIALS: (
         hdf5_kinds.TRIALS,
         (
-            *("stats", "check", "check FILE", "replay", "figures", "inspect", "export glb"),
+            *("stats", "check", "replay", "figures", "inspect", "export glb"),
             "export dexgraspbench",
         ),
     ),
     OTO: (
         hdf5_kinds.DATA,
         (
-            *("stats", "check", "check FILE", "inspect", "export glb", "export dexgraspbench"),
+            *("stats", "check", "inspect", "export glb", "export dexgraspbench"),
             *("export original", "export hf", "verify"),
         ),
     ),

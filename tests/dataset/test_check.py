@@ -59,9 +59,6 @@ def test_a_sound_dataset_passes(sound: Path, tmp_path: Path, overrides: list[str
         out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=overrides)
     assert check_dataset(out) == []
     assert broken_physics(out) == {}
-    for name in FILES:
-        shutil.copy(out / name, tmp_path / "renamed.h5")
-        assert check_dataset(tmp_path / "renamed.h5") == []
 
 
 def test_progress_ends_at_the_total(sound: Path) -> None:
@@ -118,8 +115,7 @@ def test_seal_of_a_file_finds_one_changed_bit(out: Path, name: str) -> None:
     content = bytearray((out / name).read_bytes())
     content[chunk.byte_offset + chunk.size // 2] ^= 1
     (out / name).write_bytes(content)
-    for path in (out, out / name):
-        assert (name, "", None, AS_WRITTEN) in found(path)
+    assert (name, "", None, AS_WRITTEN) in found(out)
 
 
 def test_a_value_that_was_edited_is_found(out: Path) -> None:
@@ -189,8 +185,6 @@ def test_a_truncated_file_is_found_and_the_others_are_still_checked(out: Path) -
         (OTM, "", None, "the file must be there, readable"),
         (OTO, "/train", 0, "masks must be 0..1"),
     )
-    with pytest.raises(DataError, match="cannot be read"):
-        check_dataset(out / OTM)
 
 
 def test_a_missing_file_is_found_and_the_others_are_still_checked(out: Path) -> None:
@@ -245,12 +239,6 @@ def test_each_file_of_an_object_is_checked(out: Path) -> None:
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"without manifest\.json"):
         check_dataset(tmp_path)
-    with pytest.raises(DataError, match="must be the directory"):
-        check_dataset(tmp_path / "missing.hdf5")
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["x"] = [1, 2]
-    with pytest.raises(DataError, match="another HDF5 file"):
-        check_dataset(tmp_path / "other.h5")
 
 
 def test_rows_that_break_one_rule_are_counted(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,7 +247,7 @@ def test_rows_that_break_one_rule_are_counted(out: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(check, "TASK_ROWS", 10)
     edit_file(out / TRIALS, lose)
-    (violation,) = check_dataset(out / TRIALS)
+    violation = next(v for v in check_dataset(out) if v.file == TRIALS)
     assert str(violation) == (
         "trials.hdf5 /trials row 0 and 35 more: spread must be finite always, got nan"
     )
@@ -290,15 +278,11 @@ LAYOUT_CASES: Mapping[str, tuple[str, Callable[[h5py.File], Any], str, str]] = {
 }
 
 
-#: What a file by itself does not show.
-OF_DATASET = ("schema", "camera", "split", "K", "far", "seed", "hash")
-
-
 @pytest.mark.parametrize("case", LAYOUT_CASES)
 def test_a_wrong_layout_or_attribute_is_found(out: Path, case: str) -> None:
     name, edit, group, what = LAYOUT_CASES[case]
     edit_file(out / name, edit)
-    must_find(out if case in OF_DATASET else out / name, (name, group, None, what))
+    must_find(out, (name, group, None, what), of=name)
 
 
 @pytest.mark.sim
@@ -306,7 +290,6 @@ def test_scenes_are_checked(out: Path) -> None:
     make_scenes(out, overrides=["scenes.views=2"])
     must_find(out)
     path, name = out / "scenes.hdf5", "scenes.hdf5"
-    must_find(path)
 
     def spoil(file: h5py.File) -> None:
         file["scenes/split"][0] = 3

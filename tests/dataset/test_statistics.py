@@ -16,7 +16,6 @@ from helpers.hands import write_with_preshapes
 from drakegrasp.cli.tables import approach_line, funnel_table, hold_table, unfinished_line
 from drakegrasp.config import SplitConfig
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.card import card_content
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
@@ -136,10 +135,7 @@ def test_samples_are_as_many_wherever_they_are_counted(
     counts = counts_as_dict(out)
     assert {each["name"]: each["samples"] for each in counts["objects"]} == found
 
-    # The card, the figures and the page.
-    card = card_content(out)["counts"]
-    assert {name: row["samples"] for name, row in card["objects"].items()} == found
-    assert card["all"]["samples"] == total
+    # The figures and the page.
     write_figures(out, tmp_path / "figures")
     numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
     assert {name: row["samples"] for name, row in numbers["objects"].items()} == found
@@ -195,7 +191,7 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     assert funnel.elevations[1:].tolist() == before.elevations[1:].tolist()
     total = int(funnel.distinct.sum())
 
-    # In the table and its line, of each split, in JSON and on the card.
+    # In the table and its line, of each split, and in JSON.
     table = funnel_table(funnel)
     assert list(table.columns[-1].cells) == [*map(str, funnel.distinct.tolist()), str(total)]
     assert approach_line(funnel).startswith(f"{total} distinct grasps in ")
@@ -204,10 +200,6 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     assert said["objects"][0]["distinct"] == said["objects"][0]["approach_cells"] == 2
     assert said["objects"][0]["elevations"] == {"0-30": 1, "30-60": 0, "60-90": 1}
     assert sum(split["distinct"] for split in said["splits"]) == total
-    card = card_content(out)["counts"]
-    assert card["objects"]["1_box_a"]["distinct"] == 2
-    assert card["all"]["distinct"] == sum(card["approaches"]["elevations"].values()) == total
-    assert sum(split["distinct"] for split in card["splits"].values()) == total
 
     # In another resting pose it is another grasp.
     change(out, TRIALS, "trials/resting", int(rows[1]), lambda _: 1)
