@@ -19,7 +19,7 @@ from helpers.successes import good
 
 from drakegrasp import registry
 from drakegrasp.cluster.choice import cluster_of
-from drakegrasp.dataset.assembly.removal import judge_successes
+from drakegrasp.dataset.successes import judge_successes
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset, read_closed_grasps

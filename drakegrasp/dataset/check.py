@@ -23,22 +23,24 @@ import numpy as np
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import file_attributes
-from drakegrasp.dataset.assembly.survey import headers_by_object, known_homes, shards_sha256
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_columns, says_damage
-from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
-from drakegrasp.dataset.opening import (
+from drakegrasp.dataset.hdf5 import (
     DATA_TABLES,
     OF_CAMERA,
     OF_SCENES,
     ORIGIN,
     SCENE_TABLES,
     TRIAL_TABLES,
-    Kind,
+    AnyArray,
+    Kinds,
     Tables,
     attribute_mistakes,
     differences,
+    open_hdf5,
     open_samples,
+    read_columns,
+    says_damage,
 )
+from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import (
     DATA_FILES,
     FILE_NAME,
@@ -51,6 +53,7 @@ from drakegrasp.dataset.paths import (
 )
 from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader, open_shard
+from drakegrasp.dataset.survey import headers_by_object, known_homes, shards_sha256
 from drakegrasp.dataset.trials import Stamp, Trials, reopened, stamp
 from drakegrasp.errors import DataError, DrakegraspError, MeshError, first_line, printable
 from drakegrasp.filters import Removal
@@ -76,7 +79,7 @@ from drakegrasp.vision.camera import project
 #: Number of rows in a task: some 20 MB.
 TASK_ROWS = 1024
 #: Attributes and fields of each file.
-FILES: Mapping[str, tuple[Mapping[str, Kind], Tables]] = {
+FILES: Mapping[str, tuple[Kinds, Tables]] = {
     TRIALS_FILE: (ORIGIN, TRIAL_TABLES),
     **dict.fromkeys(DATA_FILES.values(), (OF_CAMERA, DATA_TABLES)),
     SCENES_FILE: (OF_SCENES, SCENE_TABLES),

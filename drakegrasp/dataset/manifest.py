@@ -33,7 +33,6 @@ from drakegrasp.config import (
     Share,
     parse_stored,
 )
-from drakegrasp.dataset.assembly.split import Home
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, LOG_FILE, unwritable
 from drakegrasp.dataset.paths import FILE_NAME
@@ -44,6 +43,7 @@ from drakegrasp.dataset.schema import (
     refuse_other_schema,
 )
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.split import Home
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file

@@ -22,8 +22,14 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, read_columns, says_damage, write_field
-from drakegrasp.dataset.opening import open_samples
+from drakegrasp.dataset.hdf5 import (
+    ImageRows,
+    open_hdf5,
+    open_samples,
+    read_columns,
+    says_damage,
+    write_field,
+)
 from drakegrasp.dataset.remote import local_file
 from drakegrasp.dataset.schema import DATA_FIELDS, PREDICTED_ROW_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line

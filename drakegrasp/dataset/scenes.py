@@ -22,8 +22,16 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
-from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_columns, read_texts
-from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
+from drakegrasp.dataset.hdf5 import (
+    SCENE_TABLES,
+    AnyArray,
+    ImageRows,
+    open_scenes,
+    opened,
+    read_columns,
+    read_texts,
+    refuse_other_codes,
+)
 from drakegrasp.dataset.reader import GraspDataset, emptiness_of
 from drakegrasp.dataset.remote import local_file
 from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS

@@ -26,6 +26,8 @@ SCHEMA_VERSION = 5
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
 SPLITS = ("train", "valid", "test")
+#: Letters in the shapes of fields, see `Field`.
+LETTERS = ("k", "j", "S", "h", "w", "o")
 #: Units in which people read numbers, and the factors that convert SI values to them.
 SHOWN_UNITS = {"": 1.0, "s": 1.0, "N": 1.0, "kg": 1.0, "mm": 1e3, "°": float(np.rad2deg(1.0))}
 CAMERAS = ("oto", "otm")
@@ -151,12 +153,13 @@ class Field:
         return tuple(int(axis) if axis.isdecimal() else axis for axis in self.shape.split())
 
     def row_shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
-        """Return the shape of a row, with `sizes` in place of the letters.
+        """Return the shape of a row, with `sizes` in place of the letters; `6k` follows from `k`.
 
         Raises:
             KeyError: If a letter is missing.
         """
-        return tuple(sizes[axis] if isinstance(axis, str) else axis for axis in self.axes)
+        known = {**sizes, "6k": 6 * sizes.get("k", 0)}
+        return tuple(known[axis] if isinstance(axis, str) else axis for axis in self.axes)
 
     def value_of(self, source: object) -> Any:
         """Return the field's value from the source of a row, or None if its stage is missing."""
@@ -195,7 +198,7 @@ def refuse_other_schema(path: Path, version: object) -> None:
 
 def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
     """Return the lengths of the letters in the shapes."""
-    return {"k": fingers, "6k": 6 * fingers, "j": joints, "S": image}
+    return {"k": fingers, "j": joints, "S": image}
 
 
 def with_derived(

@@ -16,13 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.assembly.survey import shards_sha256
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_columns, read_names
+from drakegrasp.dataset.hdf5 import (
+    AnyArray,
+    open_hdf5,
+    open_samples,
+    open_trials,
+    read_columns,
+    read_names,
+)
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.opening import open_samples, open_trials
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import open_shard
+from drakegrasp.dataset.survey import shards_sha256
 from drakegrasp.dataset.trials import NONE, Trials
 from drakegrasp.distinct import (
     BANDS,
@@ -175,7 +181,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
     funnel, done = _empty_funnel([e.name for e in entries], [e.class_name for e in entries]), 0
     for header in manifest.headers():
         path = header.path(out)
-        with suppress(DataError), open_shard(path, header, verify_seal=False) as (file, _):
+        with suppress(DataError), open_shard(path, header, verify_seal=False) as file:
             names = [name for name in _COUNTED if name not in ("object", "removal")]
             block = read_columns(file["trials"], TRIAL_FIELDS, names)
             number = np.full(block.count, funnel.names.index(header.object_name))

@@ -20,12 +20,15 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_columns, read_names, read_texts
-from drakegrasp.dataset.opening import (
+from drakegrasp.dataset.hdf5 import (
+    AnyArray,
     open_samples,
     open_trials,
     opened,
     read_codes,
+    read_columns,
+    read_names,
+    read_texts,
     refuse_other_codes,
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE

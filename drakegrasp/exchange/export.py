@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from drakegrasp import registry
-from drakegrasp.dataset.opening import refuse_other_codes
+from drakegrasp.dataset.hdf5 import refuse_other_codes
 from drakegrasp.dataset.paths import DATA_FILES, model_path
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS

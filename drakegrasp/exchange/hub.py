@@ -183,7 +183,7 @@ def _card(out: Path, tables: Sequence[HubTable], licence: str | None) -> str:
     for table in tables:
         path = f"{table.config}/{table.split}-*.parquet"
         files.setdefault(table.config, []).append({"split": table.split, "path": path})
-    manifest, objects = read_manifest(out), {}
+    manifest, objects = read_manifest(out), dict[str, list[str]]()
     for entry in manifest.objects:
         objects.setdefault(entry.licence or "not stated", []).append(entry.name)
     splits = (astuple(count) for count in count_splits(out))

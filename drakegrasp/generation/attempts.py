@@ -18,10 +18,10 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.successes import successes_of
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.schema import CAMERAS, NO_PRESHAPE, sizes
 from drakegrasp.dataset.shards import ShardHeader, trial_columns
+from drakegrasp.dataset.successes import successes_of
 from drakegrasp.errors import DataError
 from drakegrasp.filters import RULES, Removal, first_removal
 from drakegrasp.frames import Array, pack_pose

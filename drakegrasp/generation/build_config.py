@@ -7,7 +7,7 @@ an error before anything is written.
 from __future__ import annotations
 
 from drakegrasp.config import MOST_PALMS, Config
-from drakegrasp.dataset.assembly.removal import own_filters
+from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import ConfigError
 from drakegrasp.generation.request import Part
 from drakegrasp.hand.description import load_hand

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.assembly.split import may_train
 from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.split import may_train
 from drakegrasp.errors import listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.sources import MeshSource

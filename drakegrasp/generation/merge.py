@@ -17,8 +17,6 @@ from typing import TypeAlias
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
-from drakegrasp.dataset.assembly.removal import own_filters
-from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -33,6 +31,8 @@ from drakegrasp.dataset.paths import ASSEMBLED_FILES, model_path, plan_path, sha
 from drakegrasp.dataset.prepared_objects import with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
+from drakegrasp.dataset.successes import own_filters
+from drakegrasp.dataset.survey import headers_by_object
 from drakegrasp.errors import DataError
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync

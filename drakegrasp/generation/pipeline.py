@@ -20,8 +20,6 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
-from drakegrasp.dataset.assembly.removal import judge_successes
-from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, known_homes, survey
 from drakegrasp.dataset.lock import BuildLog
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -34,6 +32,8 @@ from drakegrasp.dataset.paths import FILE_NAME, SCENES_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared, with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled, palms_in_files
+from drakegrasp.dataset.successes import judge_successes
+from drakegrasp.dataset.survey import Survey, headers_by_object, known_homes, survey
 from drakegrasp.errors import (
     DataError,
     DrakegraspError,

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from helpers.assertions import arrays_of
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
+from helpers.shards import read_shard
 
 from drakegrasp.dataset import assemble as module
-from drakegrasp.dataset import hdf5, shards
+from drakegrasp.dataset import hdf5, shards, survey
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
-from drakegrasp.dataset.assembly import survey
-from drakegrasp.dataset.assembly.successes import in_image
 from drakegrasp.dataset.lock import LOCK_FILE, build_lock
 from drakegrasp.dataset.manifest import read_manifest, with_postprocessing
 from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.dataset.successes import in_image
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import (
@@ -109,7 +109,7 @@ def spoil(out: Path, edits: Sequence[Spoil]) -> None:
     """Change the first successes, one by each edit, given their rows of /trials and of /looks."""
     left = list(edits)
     for header in read_manifest(out).headers():
-        shard = shards.read_shard(header.path(out), header)
+        shard = read_shard(header.path(out), header)
         for k, row in enumerate(shard.looks["row"].tolist()):
             if left:
                 trial = {name: values[row : row + 1] for name, values in shard.trials.items()}

@@ -24,13 +24,14 @@ from helpers.datasets import (
     set_at,
 )
 from helpers.physics import broken_physics
+from helpers.shards import read_shard
 
 from drakegrasp.dataset import check
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
-from drakegrasp.dataset.shards import read_shard, write_shard
+from drakegrasp.dataset.shards import write_shard
 from drakegrasp.errors import DataError
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.settings import override_config

@@ -27,7 +27,7 @@ from helpers.datasets import (
     set_at,
 )
 
-from drakegrasp.dataset.assembly.samples import IMAGES
+from drakegrasp.dataset.assemble import IMAGES
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import DATA_FIELDS
 from drakegrasp.frames import invert_pose, pack_pose, unpack_pose

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.assembly.removal import judge_successes
+from drakegrasp.dataset.successes import judge_successes
 from drakegrasp.filters import Removal, is_outlier
 
 

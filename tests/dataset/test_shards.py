@@ -10,12 +10,12 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from helpers.shards import HEADER, some_shard
+from helpers.shards import HEADER, read_shard, some_shard
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION
-from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
+from drakegrasp.dataset.shards import trial_columns, write_shard
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import seal
 

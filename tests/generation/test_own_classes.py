@@ -21,10 +21,10 @@ from starlette.testclient import TestClient
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
+from drakegrasp.dataset.successes import judge_successes
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.build_config import build_config

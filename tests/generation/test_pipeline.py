@@ -15,6 +15,7 @@ import pytest
 import trimesh
 from helpers.assertions import assert_same_dataset
 from helpers.builds import build
+from helpers.shards import read_shard
 from helpers.tiers import few
 
 from drakegrasp.api.building import build_dataset
@@ -23,7 +24,7 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
+from drakegrasp.dataset.shards import trial_columns, write_shard
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
 from drakegrasp.filters import Removal

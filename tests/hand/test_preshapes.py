@@ -12,7 +12,7 @@ import yaml
 from helpers.successes import good
 
 from drakegrasp.config import CandidateConfig, FilterConfig
-from drakegrasp.dataset.assembly.removal import judge_successes
+from drakegrasp.dataset.successes import judge_successes
 from drakegrasp.errors import HandError
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.export import ClosedGrasp

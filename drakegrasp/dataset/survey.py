@@ -17,14 +17,13 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.assembly.removal import judge_successes
-from drakegrasp.dataset.assembly.split import Home, find_homes, split_samples
-from drakegrasp.dataset.assembly.successes import LOOK_COLUMNS, TRIAL_COLUMNS, successes_of
-from drakegrasp.dataset.hdf5 import AnyArray, read_columns
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, sizes_in
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.dataset.schema import LOOK_FIELDS, SUCCESS_FIELDS, TRIAL_FIELDS, sizes
+from drakegrasp.dataset.schema import LOOK_FIELDS, SUCCESS_FIELDS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ShardHeader, open_shard
+from drakegrasp.dataset.split import Home, find_homes, split_samples
+from drakegrasp.dataset.successes import LOOK_COLUMNS, TRIAL_COLUMNS, judge_successes, successes_of
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.runtime.files import read_seal
@@ -96,7 +95,7 @@ def survey(
     shards, tables, first = list[ShardRows](), list[Table](), 0
     for header in headers:
         i = numbers[header.object_name]
-        with open_shard(header.path(out), header) as (file, _):
+        with open_shard(header.path(out), header) as file:
             # The rows end with the last palm pose that the dataset takes. So a dataset does not
             # depend on how many more attempts the workers had begun.
             palms, tried = file["trials/candidate"][:], manifest.objects[i].tried
@@ -108,11 +107,8 @@ def survey(
             else:
                 successes = known[header]
             if not letters:
-                letters = sizes(
-                    fingers=file["trials/closed_touching"].shape[1],
-                    joints=file["trials/closed_q"].shape[1],
-                    image=file["looks/image_otm"].shape[-1],
-                )
+                letters = sizes_in(file["trials"], TRIAL_FIELDS)
+                letters |= sizes_in(file["looks"], LOOK_FIELDS)
         successes = successes[successes["trial_id"] < count]
         own = np.full(successes.count, i, dtype=np.int32)
         ids = first + successes["trial_id"]
