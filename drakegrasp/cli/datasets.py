@@ -124,8 +124,6 @@ def merge(
 def stats(out: Dataset, /, *, as_json: AsJson = False) -> None:
     """Count outcomes, how well grasps hold, and samples.
 
-    While a build runs, or after it was stopped, the command counts the finished work units.
-
     Args:
         out: Directory of the dataset.
         as_json: Print one document of JSON instead of text.

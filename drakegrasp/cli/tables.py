@@ -19,10 +19,8 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.statistics import (
     Funnel,
     SplitCount,
-    Unfinished,
     count_funnel,
     count_splits,
-    count_unfinished,
     held_note,
     objects_without_samples,
 )
@@ -194,25 +192,6 @@ def barren_lines(funnel: Funnel) -> list[str]:
     return why[:BARREN] + ([f"no sample of {counted(left, 'other object')}"] if left > 0 else [])
 
 
-def unfinished_line(unfinished: Unfinished) -> str:
-    """Return a line on the progress of a build that is running or was stopped."""
-    if unfinished.total is None:
-        units = counted(unfinished.done, "work unit")
-        verb = "is" if unfinished.done == 1 else "are"
-        return f"not finished: {units} {verb} done; samples are chosen at the end"
-    if not unfinished.total:
-        return "not finished: its objects are not prepared yet"
-    if unfinished.done == unfinished.total:
-        return (
-            "all work units are done, but the files are missing or of another state: "
-            "`drakegrasp assemble` writes them"
-        )
-    return (
-        f"not finished: {unfinished.done:,} of {unfinished.total:,} work units are done; "
-        "samples are chosen at the end"
-    )
-
-
 #: Columns of the audit: head, cell, and whether a narrow terminal also shows it.
 _AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
     ("faces", lambda row: _number(row.faces, ","), True),
@@ -346,8 +325,7 @@ def print_table(table: Table) -> None:
 
 def print_stats(out: Path) -> None:
     """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
-    console, unfinished = make_console(), count_unfinished(out)
-    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
+    console, funnel = make_console(), count_funnel(out)
     table = funnel_table(funnel)
     # Rich would truncate numbers in a narrow terminal; the compact table has fewer columns.
     natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
@@ -356,13 +334,10 @@ def print_stats(out: Path) -> None:
     console.print(table)
     console.print(hold_table(funnel))
     console.print()
-    if unfinished is None:
-        splits = count_splits(out)
-        console.print(split_table(splits))
-        say(split_line(read_manifest(out).config.split.by, funnel, splits))
-        if line := approach_line(funnel):
-            say(line)
-        for line in barren_lines(funnel):
-            say(line)
-    else:
-        say(f"{out}: {unfinished_line(unfinished)}")
+    splits = count_splits(out)
+    console.print(split_table(splits))
+    say(split_line(read_manifest(out).config.split.by, funnel, splits))
+    if line := approach_line(funnel):
+        say(line)
+    for line in barren_lines(funnel):
+        say(line)

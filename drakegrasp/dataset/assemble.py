@@ -55,8 +55,8 @@ from drakegrasp.dataset.schema import (
     Field,
     stored_fields,
 )
-from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, open_shard
-from drakegrasp.dataset.survey import Decisions, ShardRows, Survey, decide, keys_of, survey
+from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard
+from drakegrasp.dataset.survey import Decisions, ShardRows, decide, keys_of, survey
 from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
 from drakegrasp.objects.model import ObjectModel, load_object
@@ -129,7 +129,8 @@ def assemble_locked(
     manifest: Manifest,
     *,
     rejected: Sequence[int | AttemptKey] | None = None,
-    surveyed: Survey | None = None,
+    known: Mapping[ShardHeader, Table] | None = None,
+    decisions: Decisions | None = None,
     progress: Report = silent,
 ) -> Assembly:
     """Write the three files and the manifest; the caller holds the lock.
@@ -138,18 +139,20 @@ def assemble_locked(
         out: Directory of the dataset.
         manifest: Manifest of the dataset; its filters and split may differ from those on disk.
         rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
-        surveyed: Survey of the shards, if there is one; its successes do not depend on the filters.
+        known: The successes of each shard, see `survey`.
+        decisions: What is decided about the successes, if it is decided already.
         progress: As for `assemble`.
     """
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
         # Decide which successes become samples, and in which split.
-        surveyed = surveyed or survey(out, manifest, progress=progress)
-        if rejected is not None:
-            known = keys_of(manifest, surveyed.successes)
-            manifest = replace(manifest, rejected=find_keys(rejected, known, out))
-        decisions = decide(manifest, surveyed)
-        manifest = decisions.manifest
+        if decisions is None:
+            surveyed = survey(out, manifest, known, progress=progress)
+            if rejected is not None:
+                keys = keys_of(manifest, surveyed.successes)
+                manifest = replace(manifest, rejected=find_keys(rejected, keys, out))
+            decisions = decide(manifest, surveyed)
+        manifest, surveyed = decisions.manifest, decisions.survey
 
         # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}

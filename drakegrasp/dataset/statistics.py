@@ -1,14 +1,9 @@
-"""Counts of a dataset: the funnel by object, the paper's Table III, and objects without samples.
-
-While a build runs, or after it was stopped, the funnel is counted from the shards.
-"""
+"""Counts of a dataset: the funnel by object, the paper's Table III, and objects without samples."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +16,11 @@ from drakegrasp.dataset.hdf5 import (
     open_hdf5,
     open_samples,
     open_trials,
-    read_columns,
     read_names,
 )
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import open_shard
+from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.survey import shards_sha256
 from drakegrasp.dataset.trials import NONE, Trials
 from drakegrasp.distinct import (
@@ -94,21 +87,6 @@ class SplitCount:
     classes: int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Unfinished:
-    """The state of a build that runs or was stopped.
-
-    Attributes:
-        funnel: Counts of the finished work units; no success is a sample yet.
-        done: Number of finished work units.
-        total: Number of all work units; None if it follows from their results, see `Target`.
-    """
-
-    funnel: Funnel
-    done: int
-    total: int | None
-
-
 def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     """Return whether the three files exist and are what assembling would write now.
 
@@ -149,90 +127,26 @@ def palms_in_files(out: Path) -> dict[str, int]:
     return dict(zip(names, palms.tolist(), strict=True))
 
 
-def _refuse_broken_files(out: Path) -> None:
-    """Raise an error if an existing file cannot be read, since a build would overwrite it.
-
-    Raises:
-        DataError: If there is such a file.
-    """
-    for name in ASSEMBLED_FILES:
-        if os.path.lexists(out / name):
-            with open_trials(out / name) if name == TRIALS_FILE else open_samples(out / name):
-                pass
-
-
-def count_unfinished(out: Path) -> Unfinished | None:
-    """Return the state of a build; None if the files are complete or there is no build.
-
-    The seals of the shards are not verified, since this would read all of them.
-
-    Raises:
-        DataError: If the directory holds no dataset.
-    """
-    if not os.path.lexists(out / FILE_NAME):
-        return None
-    _refuse_broken_files(out)
-    if is_assembled(out):
-        return None
-
-    # Count the attempts of the complete shards; no success is a sample yet.
-    manifest = read_manifest(out)
-    entries = manifest.objects
-    funnel, done = _empty_funnel([e.name for e in entries], [e.class_name for e in entries]), 0
-    for header in manifest.headers():
-        path = header.path(out)
-        with suppress(DataError), open_shard(path, header, verify_seal=False) as file:
-            names = [name for name in _COUNTED if name not in ("object", "removal")]
-            block = read_columns(file["trials"], TRIAL_FIELDS, names)
-            number = np.full(block.count, funnel.names.index(header.object_name))
-            removal = np.full(block.count, NONE)
-            _count_block(funnel, block.with_columns(object=number, removal=removal))
-            done += 1
-
-    # A build with a target tries as many palm poses as it needs. Without one, those that are still
-    # to be tried count as well.
-    if manifest.config.has_target and any(entry.tried is None for entry in entries):
-        return Unfinished(funnel=funnel, done=done, total=None)
-    planned = np.array([entry.candidates for entry in entries], dtype=np.int64)
-    funnel = replace(funnel, candidates=planned)
-    return Unfinished(funnel=funnel, done=done, total=manifest.units)
-
-
 def count_funnel(out: Path) -> Funnel:
     """Return the funnel of a dataset.
 
     Raises:
-        DataError: If trials.hdf5 is missing or damaged.
+        DataError: If trials.hdf5 is missing or damaged, or not of the state of the manifest.
     """
-    return funnel_of(Trials(out, any_name=True))
-
-
-def funnel_of(trials: Trials) -> Funnel:
-    """Return the funnel of attempts, see `count_funnel`."""
-    funnel = _empty_funnel(*(trials.objects[key].tolist() for key in ("name", "class_name")))
-    for block in trials.blocks(_COUNTED):
-        _count_block(funnel, block)
-
-    # From where the palms of the samples approach.
-    samples = _samples(trials)
-    cells = np.unique(np.column_stack([samples.objects, approach_cells(samples.X_OG)]), axis=0)
-    _count(funnel.approach_cells, cells[:, 0])
-    bands = elevation_bands(multiply(samples.X_TO, samples.X_OG))
-    own = samples.distinct
-    _count(funnel.elevations, (samples.objects[own], bands[own]))
-    return funnel
-
-
-def _empty_funnel(names: Sequence[str], classes: Sequence[str]) -> Funnel:
-    """Return the funnel of objects without attempts."""
-    count = len(names)
+    trials = Trials(out, any_name=True)
+    if not is_assembled(out):
+        raise DataError(
+            f"{out}: files must be those of {FILE_NAME}, got others: `drakegrasp assemble` or the "
+            "same build again writes them"
+        )
+    count = len(trials.objects["name"])
 
     def zeros(*shape: int) -> npt.NDArray[np.int64]:
         return np.zeros(shape, dtype=np.int64)
 
-    return Funnel(
-        names=tuple(names),
-        classes=tuple(classes),
+    funnel = Funnel(
+        names=tuple(trials.objects["name"].tolist()),
+        classes=tuple(trials.objects["class_name"].tolist()),
         candidates=zeros(count),
         outcomes=zeros(count, 1 + max(Outcome)),
         precision=zeros(count),
@@ -242,16 +156,24 @@ def _empty_funnel(names: Sequence[str], classes: Sequence[str]) -> Funnel:
         approach_cells=zeros(count),
     )
 
+    # The attempts, in blocks of some thousand.
+    for block in trials.blocks(_COUNTED):
+        number, removal = block["object"], block["removal"]
+        _count(funnel.candidates, number[block["standoff_index"] == 0])
+        _count(funnel.outcomes, (number, block["outcome"]))
+        _count(funnel.precision, number[block["precision"]])
+        _count(funnel.stable, number[block["stable"]])
+        decided = removal != NONE
+        _count(funnel.removals, (number[decided], removal[decided]))
 
-def _count_block(funnel: Funnel, block: Mapping[str, AnyArray]) -> None:
-    """Add attempts to a funnel, given their columns _COUNTED."""
-    number, removal = block["object"], block["removal"]
-    _count(funnel.candidates, number[block["standoff_index"] == 0])
-    _count(funnel.outcomes, (number, block["outcome"]))
-    _count(funnel.precision, number[block["precision"]])
-    _count(funnel.stable, number[block["stable"]])
-    decided = removal != NONE
-    _count(funnel.removals, (number[decided], removal[decided]))
+    # From where the palms of the samples approach.
+    samples = _samples(trials)
+    cells = np.unique(np.column_stack([samples.objects, approach_cells(samples.X_OG)]), axis=0)
+    _count(funnel.approach_cells, cells[:, 0])
+    bands = elevation_bands(multiply(samples.X_TO, samples.X_OG))
+    own = samples.distinct
+    _count(funnel.elevations, (samples.objects[own], bands[own]))
+    return funnel
 
 
 def _samples(trials: Trials) -> Table:
@@ -318,13 +240,12 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     """Return the counts of a dataset as JSON types; labels without a count are left out.
 
     Args:
-        out: Directory of the dataset; during a build, only finished work units count.
+        out: Directory of the dataset.
 
     Raises:
         DataError: If there is no dataset, or a file cannot be read.
     """
-    unfinished = count_unfinished(out)
-    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
+    funnel = count_funnel(out)
 
     def labelled(members: type[Outcome] | type[Removal], counts: AnyArray) -> dict[str, int]:
         return {each.label: int(counts[each]) for each in members if counts[each]}
@@ -345,13 +266,10 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
         }
         for i, name in enumerate(funnel.names)
     ]
-    splits = [] if unfinished else [asdict(split) for split in count_splits(out)]
-    units = {"done": unfinished.done, "total": unfinished.total} if unfinished else None
     return {
         "path": str(out),
-        "unfinished": units,
         "objects": objects,
-        "splits": splits,
+        "splits": [asdict(split) for split in count_splits(out)],
     }
 
 

@@ -205,22 +205,23 @@ TRIAL_COLUMNS = tuple(
 )
 
 
-def successes_of(rows: Mapping[str, AnyArray], camera: CameraConfig, *, object: int = 0) -> Table:
-    """Return what filters and splits need of n successes; `trial_id` counts from 0.
+def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
+    """Return what filters and splits need of n successes of a work unit.
+
+    `trial_id` is the row in the unit's /trials, `object` is 0, and `by_rule` is the reason of the
+    first rule that rejects the success: it is judged once, here.
 
     Args:
         rows: Columns of the successes' rows of `/trials` and `/looks`, by their names there;
             `depth_otm` (n, S, S) are their otm depth images [m].
-        camera: Camera that sees the grasps.
-        object: Row of the successes' object in /objects.
+        config: Configuration, whose camera and limits of filters are used.
     """
     t = Table(with_derived(rows))
-    derived = {n: d.of(t, camera) for n, d in DERIVED.items() if t.has(*d.needs)}
-    return t.only(*COPIED).with_columns(
-        derived,
-        trial_id=np.arange(t.count, dtype=np.int64),
-        object=np.full(t.count, object, dtype=np.int32),
-    )
+    derived = {n: d.of(t, config.camera) for n, d in DERIVED.items() if t.has(*d.needs)}
+    successes = t.only(*COPIED).with_columns(derived, object=np.zeros(t.count, dtype=np.int32))
+    if t.has("row"):
+        successes = successes.with_columns(trial_id=t["row"].astype(np.int64))
+    return successes.with_columns(by_rule=first_removal(successes, config.filters))
 
 
 # Removals
@@ -239,8 +240,7 @@ def judge_successes(
     """Return the `Removal` (n,) of each success.
 
     Args:
-        successes: The n successes, with the columns of `successes_of`, and of
-            `by_rule` if the rules have been applied to each before.
+        successes: The n successes, with the columns of `successes_of`.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
 
@@ -248,8 +248,7 @@ def judge_successes(
         ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
     """
     # Filters that judge each grasp by itself.
-    known = successes.has("by_rule")
-    removal = successes["by_rule"].copy() if known else first_removal(successes, config)
+    removal = successes["by_rule"].copy()
     own = _removed_by_own(config, successes)
     removal[own & (removal == Removal.KEPT)] = Removal.OWN
 
@@ -319,19 +318,6 @@ def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
             )
         removed |= ~kept
     return removed
-
-
-def successes_by_rule(rows: Table, config: Config) -> Table:
-    """Return the successes of a shard, with the first rule that removes each as column `by_rule`.
-
-    Args:
-        rows: Columns of the n successes, see `survey.shard_successes`.
-        config: Configuration, whose camera and limits of filters are used.
-    """
-    successes = successes_of(rows, config.camera)
-    return successes.with_columns(
-        trial_id=rows["row"].astype(np.int64), by_rule=first_removal(successes, config.filters)
-    )
 
 
 def find_hits(successes: Table, config: Config) -> tuple[tuple[int, int], ...]:

@@ -83,7 +83,7 @@ def survey(
     Args:
         out: Directory of the dataset.
         manifest: Its manifest.
-        known: The successes of each shard, as `successes_by_rule` returns them; None: they are read
+        known: The successes of each shard, as `successes_of` returns them; None: they are read
             from the shards.
         progress: Called with the number of surveyed shards and the number of all.
 
@@ -101,9 +101,7 @@ def survey(
             palms, tried = file["trials/candidate"][:], manifest.objects[i].tried
             count = len(palms) if tried is None else int(np.count_nonzero(palms < tried))
             if known is None:
-                rows = shard_successes(file)
-                successes = successes_of(rows, manifest.config.camera)
-                successes = successes.with_columns(trial_id=rows["row"].astype(np.int64))
+                successes = successes_of(shard_successes(file), manifest.config)
             else:
                 successes = known[header]
             if not letters:

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import Any, Literal, overload
 
 import h5py
 import numpy as np
@@ -33,14 +33,11 @@ from drakegrasp.dataset.hdf5 import (
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, SPLITS, TRIAL_FIELDS
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT, Frame, invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.table import Table
-
-if TYPE_CHECKING:
-    import pandas
 
 #: Frames in which contacts can be returned.
 FRAMES = (Frame.OBJECT, Frame.TABLE, Frame.PALM, Frame.WORLD)
@@ -279,49 +276,6 @@ class Trials:
             normals=multiply(normals, R_OF),
             forces=multiply(forces, R_OF),
         )
-
-    def to_pandas(self, names: Sequence[str] | None = None) -> pandas.DataFrame:
-        """Return a pandas data frame with a row per attempt, by trial id.
-
-        Args:
-            names: See `columns`; if None, all columns with one value per attempt. Several values of
-                an attempt become columns `slip`, `closed_q.0`, ...; outcomes and names are
-                categories.
-
-        Raises:
-            DataError: If there is no such column.
-            MachineError: If pandas is not installed.
-        """
-        try:
-            import pandas
-        except ModuleNotFoundError:
-            raise MachineError("to_pandas needs pandas, got none: pip install pandas") from None
-        if names is None:
-            names = [name for name, field in FIELDS.items() if not field.shape] + [*DERIVED]
-
-        # Several values of an attempt become several columns.
-        series: dict[str, Any] = {}
-        for name, values in self.columns(names).items():
-            if values.ndim > 1:
-                flat = values.reshape(len(values), -1)
-                series |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
-            else:
-                series[name] = values
-
-        # Outcomes and splits become texts.
-        if "outcome" in series:
-            labels = {outcome.value: outcome.label for outcome in Outcome}
-            series["outcome"] = [labels[int(value)] for value in series["outcome"]]
-        if "split" in series:
-            series["split"] = [
-                {**dict(enumerate(SPLITS)), NONE: None}[int(value)] for value in series["split"]
-            ]
-        frame = pandas.DataFrame(series, index=pandas.Index(self.trial_ids, name="trial_id"))
-        frame = frame.drop(columns="trial_id", errors="ignore")
-        words = [
-            name for name in ("outcome", "split", "object_name", "class_name") if name in frame
-        ]
-        return frame.astype(dict.fromkeys(words, "category"))
 
     # Files
 

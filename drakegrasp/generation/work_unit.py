@@ -23,7 +23,7 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import object_files, shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, ROBUST_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, write_shard
-from drakegrasp.dataset.successes import find_hits, successes_by_rule
+from drakegrasp.dataset.successes import find_hits, successes_of
 from drakegrasp.dataset.survey import headers_by_object, shard_successes
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
@@ -109,7 +109,7 @@ class UnitSummary:
         seconds: Wall-clock time by stage (`build`, `try`, `measure`, `look`, `repeat` if there are
             repeats, `write`) [s]; for logs only. Empty if the shard existed already.
         errors: Number of solver errors by message.
-        successes: The successes with what filters need of each, see `successes_by_rule`; None
+        successes: The successes with what filters need of each, see `successes_of`; None
             without a target.
         hits: Candidates and stand-offs of the attempts that count for the target, see `find_hits`;
             empty without a target.
@@ -344,7 +344,7 @@ def _judged(rows: Table, config: Config) -> dict[str, Any]:
     """
     if not config.has_target:
         return {}
-    successes = successes_by_rule(rows, config)
+    successes = successes_of(rows, config)
     return {"successes": successes, "hits": find_hits(successes, config)}
 
 

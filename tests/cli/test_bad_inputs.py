@@ -22,7 +22,7 @@ from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
 from helpers.bad_inputs.kinds import Kind, Workplace
 from helpers.commands import Result
 from helpers.commands import run as run_command
-from helpers.datasets import OTM, OTO, REPEATED, TRIALS, make_dataset
+from helpers.datasets import OTO, REPEATED, TRIALS, make_dataset
 from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
@@ -253,10 +253,6 @@ def test_files(base: Path, tmp_path: Path, file: str, command: str) -> None:
 @every_command
 def test_every_kind_with_every_command(base: Path, tmp_path: Path, file: str, command: str) -> None:
     walk(base, tmp_path, file, FILES[file][0], command)
-
-
-def test_manifest_of_unfinished(base: Path, tmp_path: Path) -> None:
-    walk(base, tmp_path, MANIFEST, manifests.MANIFEST[::20], "inspect", OTO, OTM, TRIALS)
 
 
 @pytest.mark.parametrize("command", [*map(in_second_tier, ("check", "inspect")), "stats"])

@@ -186,11 +186,10 @@ def test_a_success_that_is_spoiled_is_removed_for_that_reason(out: Path, first: 
 @pytest.fixture
 def removed(sound: Path) -> Callable[..., Counter[Removal]]:
     """Returns how many successes assembling with other filters removes, by the reason."""
-    manifest = read_manifest(sound)
-    surveyed = survey.survey(sound, manifest)
 
     def count(*overrides: str) -> Counter[Removal]:
-        decisions = survey.decide(with_postprocessing(manifest, overrides), surveyed)
+        manifest = with_postprocessing(read_manifest(sound), overrides)
+        decisions = survey.decide(manifest, survey.survey(sound, manifest))
         return Counter(map(Removal, decisions.removal.tolist()))
 
     return count

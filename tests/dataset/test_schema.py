@@ -28,7 +28,7 @@ from drakegrasp.dataset.schema import (
     sizes,
 )
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
-from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
+from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import DataError
 from drakegrasp.generation.attempts import TrialRow
 from drakegrasp.generation.replay import replay_trial
@@ -141,7 +141,6 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (GraspDataset, OTO),
         (check_dataset, FILE_NAME),
         (assemble, FILE_NAME),
-        (count_unfinished, TRIALS),
         (count_funnel, TRIALS),
         (count_splits, TRIALS),
         (partial(claim_directory, config=load_config()), FILE_NAME),

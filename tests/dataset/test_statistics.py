@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -12,15 +11,13 @@ import numpy as np
 import pytest
 from helpers.datasets import SLIPPED, SUCCESS, TRIALS, change, make_dataset
 
-from drakegrasp.cli.tables import approach_line, funnel_table, hold_table, unfinished_line
+from drakegrasp.cli.tables import approach_line, funnel_table, hold_table
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.statistics import (
     count_funnel,
     count_splits,
-    count_unfinished,
     counts_as_dict,
     objects_without_samples,
 )
@@ -43,41 +40,6 @@ def test_words_are_counted_by_object(out: Path) -> None:
     assert funnel.precision.tolist() == [2, 3, 3]
     assert funnel.stable.tolist() == [1, 3, 3]
     assert SLIPPED not in (SUCCESS, 3)
-
-
-def test_words_of_a_build_that_runs_are_those_of_its_shards(out: Path) -> None:
-    """The second shard of an object has one of its successes."""
-    (out / TRIALS).unlink()
-    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
-    unfinished = count_unfinished(out)
-    assert unfinished is not None
-    assert unfinished.funnel.precision.tolist() == [3, 2, 3]
-    assert unfinished.funnel.stable.tolist() == [3, 2, 3]
-    assert not unfinished.funnel.removals[:, Removal.KEPT].any()
-
-
-def test_build_with_a_target_runs_as_many_units_as_it_needs(out: Path) -> None:
-    """Its number of units is not known before; what was tried is counted, not what was drawn."""
-    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
-    manifest = read_manifest(out)
-    manifest = replace(manifest, config=manifest.config.model_copy(update={"samples": 9}))
-    write_manifest(manifest, out)
-    unfinished = count_unfinished(out)
-    assert unfinished is not None
-    assert (unfinished.done, unfinished.total) == (5, None)
-    assert unfinished.funnel.candidates.tolist() == [4, 2, 4]
-    assert unfinished_line(unfinished) == (
-        "not finished: 5 work units are done; samples are chosen at the end"
-    )
-    assert counts_as_dict(out)["unfinished"] == {"done": 5, "total": None}
-
-    # When it is met, the number is known.
-    met = tuple(replace(entry, tried=2) for entry in manifest.objects)
-    write_manifest(replace(manifest, objects=met), out)
-    unfinished = count_unfinished(out)
-    assert unfinished is not None
-    assert (unfinished.done, unfinished.total) == (3, 3)
-    assert "`drakegrasp assemble` writes them" in unfinished_line(unfinished)
 
 
 def test_samples_are_as_many_wherever_they_are_counted(

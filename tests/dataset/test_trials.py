@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from drakegrasp.dataset import trials as trials_module
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.trials import NONE, Trials
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.outcomes import Outcome
 
@@ -168,27 +167,6 @@ def test_contacts_of_another_moment_or_frame_are_refused(sound: Path) -> None:
         Trials(sound).contacts("open")  # type: ignore[arg-type]
     with pytest.raises(DataError, match=r"frame must be one of object, table, .* got 'camera'"):
         Trials(sound).contacts(frame="camera")
-
-
-def test_data_frame_has_a_row_per_attempt(sound: Path) -> None:
-    pytest.importorskip("pandas")
-    trials = Trials(sound).where(object_name="2_box_b")
-    frame = trials.to_pandas()
-    assert frame.index.tolist() == list(range(12, 24))
-    assert frame.loc[12, "outcome"] == "success"
-    assert frame["slip"].tolist()[:1] == trials["slip"].tolist()[:1]
-    assert frame["object_name"].cat.categories.tolist() == ["2_box_b"]
-    wide = trials.to_pandas(["closed_p_OQ"])
-    assert [*wide] == [f"closed_p_OQ.{i}" for i in range(9)]
-    np.testing.assert_array_equal(wide.to_numpy(), trials["closed_p_OQ"].reshape(12, 9))
-
-
-def test_data_frame_without_pandas_is_one_line(
-    sound: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(MachineError, match="to_pandas needs pandas, got none: pip install pandas"):
-        Trials(sound).to_pandas()
 
 
 def test_file_that_was_replaced_is_refused(out: Path) -> None:
