@@ -31,8 +31,7 @@ def assemble(
 
     Args:
         out: Directory of the dataset.
-        reject: Trials that must not become samples: the reject.json of an inspection, or a text
-            file with one id per line; # starts a comment.
+        reject: Trials that must not become samples: the reject.json of an inspection.
         overrides: Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may
             be given several times. Your own filters must be given again:
             filters.own=FILE.py:NAME.
@@ -42,9 +41,9 @@ def assemble(
     from drakegrasp.dataset.assemble import assemble as assemble_files
     from drakegrasp.dataset.check import check_hand
     from drakegrasp.dataset.manifest import read_manifest
-    from drakegrasp.dataset.rejections import read_rejected, unused_rejections
+    from drakegrasp.dataset.rejections import read_decisions, unused_rejections
 
-    rejected = () if reject is None else read_rejected(reject)
+    rejected = () if reject is None else sorted(read_decisions(reject).rejected)
     with progress_bar("assemble", "shards") as progress:
         assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
         manifest = read_manifest(out)

@@ -121,9 +121,8 @@ def verify(
 
     The command reports whether each grasp holds its object, and if not, why.
 
-    GRASPS is a .npy array with one row per grasp, a .csv file with one line per grasp, or an HDF5
-    file with an array `grasps` at its root or in a group. An array `rows` in the same place names
-    the rows of the dataset. A grasp has 6 numbers per finger (18 for the Barrett Hand): the contact
+    GRASPS is a .npy array with one row per grasp, or an HDF5 file with an array `grasps` at its
+    root or in a group. An array `rows` in the same place names the rows of the dataset. A grasp has 6 numbers per finger (18 for the Barrett Hand): the contact
     points in metres, then the outward unit normals, in the order of the hand's fingers.
 
     GRASPS may also be a file or a folder of postures, as for `build --postures`. They are tried on

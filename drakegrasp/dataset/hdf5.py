@@ -39,7 +39,7 @@ from drakegrasp.dataset.schema import (
     refuse_other_schema,
 )
 from drakegrasp.errors import DataError, first_line, printable
-from drakegrasp.foreign_files import NAME_RULE, is_name, parse_json, refuse_irregular
+from drakegrasp.foreign_files import parse_json, refuse_irregular
 from drakegrasp.table import AnyArray as AnyArray
 from drakegrasp.table import Table
 
@@ -370,19 +370,6 @@ def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:
         if not text.isprintable():
             raise DataError(f"{path}: a name must be printable, got {text!r}")
     return texts
-
-
-def read_names(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the names of objects in a dataset of texts; they may become names of files.
-
-    Raises:
-        DataError: If one of them is not a valid name.
-    """
-    names = read_texts(dataset)
-    for name in names:
-        if not is_name(name):
-            raise DataError(f"{dataset.file.filename}: a name must be {NAME_RULE}, got {name!r}")
-    return names
 
 
 def read_columns(

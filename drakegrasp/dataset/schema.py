@@ -6,9 +6,8 @@ is not listed here is in no file. Imports only NumPy, so that a reader can load 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -210,12 +209,6 @@ def with_derived(
         if field.derive is not None and all(name in columns for name in field.needs):
             found[field.name] = field.derive(columns).astype(field.dtype)
     return found
-
-
-def sources_of(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns of a shard from which given columns of `/trials` are read or derived."""
-    needs = {field.name: field.needs for field in TRIAL_FIELDS if field.derive is not None}
-    return tuple(dict.fromkeys(chain.from_iterable(needs.get(name, (name,)) for name in names)))
 
 
 def stored_fields(fields: Sequence[Field], *, repeats: bool) -> tuple[Field, ...]:

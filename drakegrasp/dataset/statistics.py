@@ -14,12 +14,9 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import (
     AnyArray,
     open_hdf5,
-    open_samples,
-    open_trials,
-    read_names,
 )
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.paths import ASSEMBLED_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.survey import shards_sha256
 from drakegrasp.dataset.trials import NONE, Trials
@@ -119,12 +116,10 @@ def palms_in_files(out: Path) -> dict[str, int]:
     """
     if not os.path.lexists(out / TRIALS_FILE):
         return {}
-    with open_trials(out / TRIALS_FILE) as file:
-        names = read_names(file["objects/name"])
-        objects, candidates = (file[f"trials/{name}"][:] for name in ("object", "candidate"))
-    palms = np.zeros(len(names), dtype=np.int64)
-    np.maximum.at(palms, objects, candidates + 1)
-    return dict(zip(names, palms.tolist(), strict=True))
+    trials = Trials(out)
+    palms = np.zeros(len(trials.objects["name"]), dtype=np.int64)
+    np.maximum.at(palms, trials["object"], trials["candidate"] + 1)
+    return dict(zip(trials.objects["name"].tolist(), palms.tolist(), strict=True))
 
 
 def count_funnel(out: Path) -> Funnel:
@@ -133,7 +128,7 @@ def count_funnel(out: Path) -> Funnel:
     Raises:
         DataError: If trials.hdf5 is missing or damaged, or not of the state of the manifest.
     """
-    trials = Trials(out, any_name=True)
+    trials = Trials(out)
     if not is_assembled(out):
         raise DataError(
             f"{out}: files must be those of {FILE_NAME}, got others: `drakegrasp assemble` or the "
@@ -222,18 +217,22 @@ def count_splits(out: Path) -> list[SplitCount]:
     Raises:
         DataError: If a file is missing or damaged.
     """
-    distinct = distinct_samples(Trials(out, any_name=True))
-    with open_samples(out / DATA_FILES["oto"]) as file:
-        return [
+    trials = Trials(out)
+    samples, counts = trials.where(sample=True), list[SplitCount]()
+    columns = samples.columns(("split", "object", "class_name"))
+    distinct = np.isin(samples.trial_ids, distinct_samples(trials))
+    for i, split in enumerate(SPLITS):
+        own = columns["split"] == i
+        counts.append(
             SplitCount(
                 split=split,
-                samples=len(file[split]["grasps"]),
-                distinct=int(np.isin(file[split]["trial_id"][:], distinct).sum()),
-                objects=len(set(read_names(file[split]["object_props/object_name"]))),
-                classes=len(set(read_names(file[split]["object_props/class_name"]))),
+                samples=int(own.sum()),
+                distinct=int(distinct[own].sum()),
+                objects=len(np.unique(columns["object"][own])),
+                classes=len(set(columns["class_name"][own])),
             )
-            for split in SPLITS
-        ]
+        )
+    return counts
 
 
 def counts_as_dict(out: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from drakegrasp.dataset.hdf5 import AnyArray, read_columns, sizes_in
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.dataset.schema import LOOK_FIELDS, SUCCESS_FIELDS, TRIAL_FIELDS
+from drakegrasp.dataset.schema import LOOK_FIELDS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ShardHeader, open_shard
 from drakegrasp.dataset.split import Home, find_homes, split_samples
 from drakegrasp.dataset.successes import LOOK_COLUMNS, TRIAL_COLUMNS, judge_successes, successes_of
@@ -179,11 +179,6 @@ class Decisions:
         return {
             split: self.survey.successes["trial_id"][rows] for split, rows in self.splits.items()
         }
-
-    def columns(self) -> dict[str, AnyArray]:
-        """Return the columns of /successes: why each success is, or is not, a sample."""
-        own = self.survey.successes.only(*(f.name for f in SUCCESS_FIELDS))
-        return {"removal": self.removal, **own}
 
 
 def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:

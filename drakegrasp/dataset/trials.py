@@ -27,7 +27,6 @@ from drakegrasp.dataset.hdf5 import (
     opened,
     read_codes,
     read_columns,
-    read_names,
     read_texts,
     refuse_other_codes,
 )
@@ -63,8 +62,6 @@ class Trials:
 
     Args:
         out: Directory of an assembled dataset, or its trials.hdf5.
-        any_name: Whether objects may have names that are not valid names of files, which is enough
-            for display.
 
     Attributes:
         path: The directory of the dataset, or its trials.hdf5, as an absolute path.
@@ -75,13 +72,11 @@ class Trials:
         DataError: If the file is missing, damaged or differs from the schema.
     """
 
-    def __init__(self, out: str | Path, *, any_name: bool = False) -> None:
+    def __init__(self, out: str | Path) -> None:
         self.path = Path(out).absolute()
         path = self.path if self.path.is_file() else self.path / TRIALS_FILE
         with open_trials(path) as file:
             group = file["objects"]
-            if not any_name:
-                read_names(group["name"])
             self.objects: Mapping[str, AnyArray] = {
                 f.name: np.array(read_texts(group[f.name]), dtype=object)
                 if f.dtype == "str"

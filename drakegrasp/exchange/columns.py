@@ -1,6 +1,6 @@
 """Files of arrays, as other programs write them, and the contacts that some of them hold.
 
-Input: a NumPy or HDF5 file, for contacts also a CSV file. Output: its arrays as they are stored, or
+Input: a NumPy or HDF5 file. Output: its arrays as they are stored, or
 the grasps as k points and k outward normals each, with dataset rows and confidence; or an error in
 one line. The meaning of arrays of postures is a matter of `attempts`.
 """
@@ -15,12 +15,12 @@ import numpy as np
 
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line, one_line
-from drakegrasp.foreign_files import LARGEST_TEXT, read_npz, refuse_irregular
+from drakegrasp.foreign_files import read_npz, refuse_irregular
 from drakegrasp.frames import Array, as_numbers
 
 #: Suffixes of HDF5 files, of all files of several arrays, and of files that can hold contacts.
 HDF5_SUFFIXES = (".h5", ".hdf5")
-ARRAYS, CONTACTS = (".npz", *HDF5_SUFFIXES), (".npy", *HDF5_SUFFIXES, ".csv")
+ARRAYS, CONTACTS = (".npz", *HDF5_SUFFIXES), (".npy", *HDF5_SUFFIXES)
 #: Maximum total size of the arrays of a file [bytes]: two million postures of a hand with 16
 #: joints.
 MOST_BYTES = 1_000_000_000
@@ -94,9 +94,8 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
     the file does not have are None.
 
     Args:
-        path: A `.npy` file, (n, m) or (m,); a `.csv` file with a line per grasp and optionally a
-            header; or an HDF5 file (`.h5`, `.hdf5`) with an array `grasps`, and optionally `rows`
-            and `confidence`, all at the root or all in one group.
+        path: A `.npy` file, (n, m) or (m,); or an HDF5 file (`.h5`, `.hdf5`) with an array
+            `grasps`, and optionally `rows` and `confidence`, all at the root or all in one group.
         split: Name of the group to read in an HDF5 file. If it is None or there is no such group,
             the root is read. If it is None and the root has no grasps, the only group with grasps
             is read.
@@ -114,8 +113,6 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
     try:
         if suffix == ".npy":
             arrays = {GRASPS: read_numbers(path)}
-        elif suffix == ".csv":
-            arrays = {GRASPS: _read_csv(path)}
         else:
             with open_hdf5(path) as file:
                 group = _choose_group(path, file, split)
@@ -124,10 +121,9 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
     except GraspError:
         raise
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
-        named = "" if suffix == ".csv" else f" by the name {GRASPS!r}"
         raise GraspError(
-            f"{path}: must be a file of grasps, rows of equally many numbers{named}, "
-            f"got none ({first_line(error)})"
+            f"{path}: must be a file of grasps, rows of equally many numbers by the name "
+            f"{GRASPS!r}, got none ({first_line(error)})"
         ) from None
 
     # One row per grasp.
@@ -143,19 +139,6 @@ def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dic
             )
         rows = rows.astype(np.int64)
     return {GRASPS: grasps, ROWS: rows, CONFIDENCE: arrays.get(CONFIDENCE)}
-
-
-def _read_csv(path: Path) -> Array:
-    """Return the numbers of a text file, one row per line, without the header."""
-    refuse_irregular(path, LARGEST_TEXT)
-    lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
-    # The first line is a header only if it has several cells and none of them is a number. A
-    # mistyped grasp, or a grasp without commas, must not be taken for a header.
-    cells = lines[0].split(",") if lines else []
-    header = len(cells) > 1 and not any(map(_is_number, cells))
-    if not lines[header:]:
-        raise GraspError(f"{path}: must hold at least one grasp, got none")
-    return np.loadtxt(lines[header:], delimiter=",", comments=None, ndmin=2)
 
 
 def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
@@ -189,12 +172,3 @@ def _grasps(array: Array, where: str, axes: int) -> Array:
             f"got an array of shape {array.shape}{_POSES if array.shape[-2:] == (4, 4) else ''}"
         )
     return np.atleast_2d(array)
-
-
-def _is_number(text: str) -> bool:
-    """Return whether a cell of a text file is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

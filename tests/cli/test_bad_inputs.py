@@ -311,7 +311,6 @@ def _npy(path: Path, array: np.ndarray) -> bytes:
 #: Predictions by suffix: how they can be spoiled, and what they are verified against.
 PREDICTIONS = {
     ".npy": (array_kinds.PREDICTIONS_NPY, "--object {mesh}"),
-    ".csv": (array_kinds.PREDICTIONS_CSV, "--object {mesh}"),
     ".h5": (array_kinds.PREDICTIONS_HDF5, "--dataset {data}"),
 }
 
@@ -321,9 +320,7 @@ def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
     import h5py
 
     sound = _npy(tmp_path, array_kinds.GRASP)
-    if suffix == ".csv":
-        sound = array_kinds.LINE.encode()
-    elif suffix == ".h5":
+    if suffix == ".h5":
         with h5py.File(tmp_path / "sound.h5", "w") as file:
             file["grasps"] = np.tile(array_kinds.GRASP, (2, 1))
             file["rows"] = np.arange(2)
@@ -347,8 +344,6 @@ def test_decisions(base: Path, tmp_path: Path) -> None:
     before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file} --workers 1"
     sound = (base / REJECT).read_bytes()
     walk_file(base, tmp_path, sound, ".json", manifests.DECISIONS, command)
-    kinds = manifests.REJECTED_IDS
-    walk_file(base, tmp_path, b"0\n", ".txt", kinds, command, "rejected trials")
     assert (out / MANIFEST).read_bytes() == before
 
 

@@ -6,7 +6,6 @@ grasps are of two preshapes, and friction and mass are not those of the configur
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -261,23 +260,17 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
 def test_palms_on_exported_meshes_are_the_same_trials(
     out: Path, samples: Trials, written: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    """A network adds poses in the frame of `file` to the table of rows, and nothing else."""
+    """Of the palm link, of samples in the third resting pose and of another."""
     folder, hand = written("meshes"), load_hand(HAND)
-    with (folder / "rows_train.csv").open(newline="") as text:
-        rows = list(csv.DictReader(text))
-
-    # Poses of the palm link, of samples in the third resting pose and of another.
     chosen = [*np.flatnonzero(samples["resting"] == 2)[:2], 0]
     X_OB = unpack_pose(samples["X_OG"]) @ np.linalg.inv(hand.X_BG)
-    own = [rows[i] for i in chosen]
-    numbers = ("resting", *CONDITIONS)
     np.savez(
         tmp_path / "palms.npz",
         X_FG=X_OB[chosen],
-        object=[row["object"] for row in own],
+        object=[NAME] * len(chosen),
+        row=np.array(chosen, dtype=np.int64),
         preshape=[hand.preshape_names[samples["preshape"][i]] for i in chosen],
-        **{n: np.array([float(row[n]) for row in own]) for n in numbers},
-        row=[int(row["row"]) for row in own],
+        **{name: samples[name][chosen] for name in ("resting", *CONDITIONS)},
     )
 
     # On the rows of the dataset, and on the mesh that was exported, of whose unit nothing is said.

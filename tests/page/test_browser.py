@@ -25,7 +25,6 @@ from drakegrasp.dataset.rejections import (
     AttemptKey,
     Decisions,
     read_decisions,
-    read_rejected,
     write_decisions,
 )
 from drakegrasp.dataset.schema import SPLITS
@@ -310,7 +309,7 @@ def test_buttons_reject_and_assembly_drops_exactly_these(
     # The same button again withdraws the decision.
     page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
     wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
-    assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
+    assembly = assemble(out, rejected=sorted(read_decisions(out / "reject.json").rejected))
     assert assembly.removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
 
 
