@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import h5py
 import numpy as np
@@ -73,22 +73,43 @@ _KNOWN = (
 )
 
 
-@overload
-def read_attempts(
-    path: Path, hand: Hand, *, of: None = None, read_as: Mapping[str, str] | None = None
-) -> Attempts: ...
-
-
-@overload
-def read_attempts(
+def read_predictions(
     path: Path,
     hand: Hand,
     *,
-    of: str | GraspDataset | None,
+    of: str | GraspDataset,
     split: str | None = None,
     several: bool = False,
     read_as: Mapping[str, str] | None = None,
-) -> Attempts | ContactRows: ...
+) -> Attempts | ContactRows:
+    """Return the postures or the contacts of a file as a table; contacts do not name their objects.
+
+    Args:
+        path: The file, or a folder of files of postures.
+        hand: The hand.
+        of: See `read_attempts`; contacts are all for this object, or for the rows of this split.
+        split: Name of the group to read in an HDF5 file of contacts; if `of` is a split of a
+            dataset, the group of this split is read.
+        several: Whether the contacts are for rows of a dataset, of which each may have several
+            grasps (n, m, 6k), with a confidence.
+        read_as: See `read_attempts`.
+
+    Raises:
+        GraspError: If the file has no contacts or postures of this hand.
+        DataError: If the dataset cannot be used.
+        MachineError: If a package is missing that the format needs.
+    """
+    if holds_postures(path):
+        return read_attempts(path, hand, of=of, read_as=read_as)
+    data = of if isinstance(of, GraspDataset) else None
+    said = read_contacts(path, split=data.split if data else split, axes=3 if several else 2)
+    with named(path):
+        if several and data is not None:
+            return read_several(**said, fingers=hand.num_fingers, data=data)
+        table = read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
+        if (stated := said["confidence"]) is None:
+            return table
+        return replace(table, confidence=read_confidence(stated, (len(table),)))
 
 
 def read_attempts(
@@ -96,11 +117,9 @@ def read_attempts(
     hand: Hand,
     *,
     of: str | GraspDataset | None = None,
-    split: str | None = None,
-    several: bool = False,
     read_as: Mapping[str, str] | None = None,
-) -> Attempts | ContactRows:
-    """Return the postures or contacts of a file, or the postures of a folder of files, as a table.
+) -> Attempts:
+    """Return the postures of a file, or of a folder of files, as a table.
 
     An invalid row stays in the table, with the reason. An invalid file of a folder is one such row.
 
@@ -112,12 +131,7 @@ def read_attempts(
             a column `row`, or one grasp per row of the split, or exported samples, of which those
             of the split are used, or grasps that only name their object, each of which is used for
             every row of this object. Objects, and the camera for grasps in the frame "camera", are
-            those of the rows, and `Attempts.of_row` has the row numbers. Contacts do not name an
-            object, so `of` must be given for them.
-        split: Name of the group to read in an HDF5 file of contacts; if `of` is a split of a
-            dataset, the group of this split is read.
-        several: Whether the contacts are for rows of a dataset, of which each may have several
-            grasps (n, m, 6k), with a confidence.
+            those of the rows, and `Attempts.of_row` has the row numbers.
         read_as: Values for all postures. `frame` and `link` replace those of the file; `preshape`
             is used for rows that do not name one.
 
@@ -126,19 +140,6 @@ def read_attempts(
         DataError: If the dataset cannot be used.
         MachineError: If a package is missing that the format needs.
     """
-    # Contacts, which do not name their objects.
-    if of is not None and not holds_postures(path):
-        data = of if isinstance(of, GraspDataset) else None
-        said = read_contacts(path, split=data.split if data else split, axes=3 if several else 2)
-        with named(path):
-            if several and data is not None:
-                return read_several(**said, fingers=hand.num_fingers, data=data)
-            table = read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
-            if (stated := said["confidence"]) is None:
-                return table
-            return replace(table, confidence=read_confidence(stated, (len(table),)))
-
-    # Postures of a file, or of all files of a folder.
     read_as = read_as or {}
     if isinstance(of, GraspDataset):
         return _for_rows(path, hand, of, read_as)
