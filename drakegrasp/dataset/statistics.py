@@ -249,15 +249,18 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     def labelled(members: type[Outcome] | type[Removal], counts: AnyArray) -> dict[str, int]:
         return {each.label: int(counts[each]) for each in members if counts[each]}
 
-    numbers = ("precision", "stable", "samples", "distinct", "approach_cells")
+    def numbers(i: int, *names: str) -> dict[str, int]:
+        return {name: int(getattr(funnel, name)[i]) for name in names}
+
     objects = [
         {
             "name": name,
             "class": funnel.classes[i],
             "candidates": int(funnel.candidates[i]),
             "outcomes": labelled(Outcome, funnel.outcomes[i]),
+            **numbers(i, "precision", "stable"),
             "removals": labelled(Removal, funnel.removals[i]),
-            **{name: int(getattr(funnel, name)[i]) for name in numbers},
+            **numbers(i, "samples", "distinct", "approach_cells"),
             "elevations": {
                 f"{low}-{high}": int(count)
                 for (low, high), count in zip(BANDS, funnel.elevations[i], strict=True)

@@ -99,7 +99,7 @@ class HubTable:
         columns: Fields of the columns that are no images.
         has_images: Whether there are the columns `IMAGES`.
         read: Function that takes a start and an end (excluded) and returns the columns of these
-            rows as lists; an image is a cell of `png_cell`.
+            rows; an image is a cell of `png_cell`.
     """
 
     config: str
@@ -107,7 +107,7 @@ class HubTable:
     count: int
     columns: Columns
     has_images: bool
-    read: Callable[[int, int], dict[str, list[Any]]]
+    read: Callable[[int, int], dict[str, Any]]
 
     def write(self, folder: Path, wrote: Callable[[int], None]) -> None:
         """Write the files of the table into the folder of its configuration.
@@ -216,16 +216,25 @@ def _sample_table(out: Path, camera: str, split: str) -> HubTable:
     """Return the table of a split's samples with the images of a camera."""
     data = GraspDataset(out / DATA_FILES[camera], split=split, fewer_fingers=True)
 
-    def read(start: int, stop: int) -> dict[str, list[Any]]:
+    def read(start: int, stop: int) -> dict[str, Any]:
         samples = (data[row] for row in range(start, stop))
         images = [encode_images(sample.image, sample.mask) for sample in samples]
         return by_name(images) | {
-            name: data.rows(field.name, start, stop).tolist() for name, field in COLUMNS.items()
+            name: _cells(data.rows(field.name, start, stop)) for name, field in COLUMNS.items()
         }
 
     return HubTable(
         config=camera, split=split, count=len(data), columns=COLUMNS, has_images=True, read=read
     )
+
+
+def _cells(values: npt.NDArray[Any]) -> Any:
+    """Return a column in a form that `datasets` takes; as a list it rejects seeds of 64 bits."""
+    if values.dtype != np.uint64:
+        return values.tolist()
+    import pyarrow
+
+    return pyarrow.array(values)
 
 
 def by_name(images: Sequence[Iterable[Any]]) -> dict[str, list[Any]]:
@@ -271,16 +280,16 @@ def _scene_table(
     own, scenes = data.tables[group], data.tables["scenes"]
     rows = np.flatnonzero(scenes["split"][own["scene"]] == SPLITS.index(split))
 
-    def read(start: int, stop: int) -> dict[str, list[Any]]:
+    def read(start: int, stop: int) -> dict[str, Any]:
         at = rows[start:stop]
         scene = own["scene"][at]
         objects = scenes["object"][scene]
-        found: dict[str, list[Any]] = {
+        found: dict[str, Any] = {
             "object_name": np.array(data.names, dtype=object)[objects].tolist(),
             "class_name": np.array(data.classes, dtype=object)[objects].tolist(),
         }
         for name in columns.keys() - found.keys():
-            found[name] = (own[name][at] if name in own else scenes[name][scene]).tolist()
+            found[name] = _cells(own[name][at] if name in own else scenes[name][scene])
         if group == "views":
             found |= by_name([map(png_cell, data.stored_images(row)) for row in at.tolist()])
         return found

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.commands import run
+from helpers.datasets import change
 from PIL import Image
 
 from drakegrasp.dataset.reader import GraspDataset
@@ -189,6 +190,13 @@ def test_long_splits_are_cut_into_files(
     assert len(list((tmp_path / "to" / "oto").glob("test-*.parquet"))) == -(-len(data) // 2) > 1
     ids = [row["trial_id"] for row in table_of(tmp_path / "to", "oto", "test")]
     assert ids == data.column("trial_id").tolist()
+
+
+def test_seeds_of_64_bits_are_exported(dataset: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(dataset, tmp_path / "out"))
+    change(out, "grasping_oto.hdf5", "test/conditions/depth_seed", 0, lambda _: 2**64 - 1)
+    export_dataset(out, tmp_path / "to", "hf")
+    assert table_of(tmp_path / "to", "oto", "test")[0]["depth_seed"] == 2**64 - 1
 
 
 @pytest.mark.sim
