@@ -18,8 +18,7 @@ from helpers.shards import read_shard
 
 from drakegrasp.dataset import assemble as module
 from drakegrasp.dataset import hdf5, shards, survey
-from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
-from drakegrasp.dataset.lock import LOCK_FILE, build_lock
+from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest, with_postprocessing
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.dataset.successes import in_image
@@ -75,12 +74,6 @@ def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=["unit_candidates=1"])
     assert len(list(out.glob("shards/*/*.h5"))) == 12
     assert assemble(out).removed == {Removal.KEPT: 9}
-
-
-def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
-    with build_lock(out):
-        assert assemble_locked(out, read_manifest(out)) == summarise(out)
-        assert (out / LOCK_FILE).exists()
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -241,11 +234,6 @@ def test_contact_is_in_view_within_the_image_and_before_the_camera(p_CQ: Any, se
     K = np.array([[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]])
     p_CQ = np.array([[0.0, 0.0, 0.4], p_CQ, [np.nan] * 3])
     assert in_image(K, 33, p_CQ).tolist() == [True, seen, False]
-
-
-def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
-    assert assemble(out, overrides=[f"filters.max_slip={SLIP / 2}"]).removed == {Removal.SLID: 9}
-    assert assemble(out, overrides=["filters.require=held"]).removed == {Removal.KEPT: 9}
 
 
 @pytest.mark.parametrize("override", ["filters.require=held", "filters.max_slip=null"])

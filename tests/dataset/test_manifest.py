@@ -201,10 +201,3 @@ def test_dataset_of_other_results_is_not_continued(tmp_path: Path, name: str, ve
     write_manifest(Manifest(config=config, versions=versions), tmp_path)
     with pytest.raises(DataError, match=rf"must be continued with {name} {version}, which made it"):
         claim_directory(tmp_path, config)
-
-
-def test_dataset_of_another_h5py_is_continued(tmp_path: Path) -> None:
-    config = load_config()
-    versions = {**installed_versions(config), "h5py": "other"}
-    write_manifest(Manifest(config=config, versions=versions), tmp_path)
-    assert claim_directory(tmp_path, config) is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import OTO, SUCCESS, TRIALS, edit_file
+from helpers.datasets import OTO, TRIALS, edit_file
 
 from drakegrasp.dataset import trials as trials_module
 from drakegrasp.dataset.assemble import assemble
@@ -91,17 +90,6 @@ def test_choice_is_of_what_was_asked_for(
 ) -> None:
     (rows,) = np.nonzero(np.isin(stored(sound, name), wanted))
     assert Trials(sound).where(**filters).trial_ids.tolist() == rows.tolist()
-
-
-def test_choices_of_choices_are_narrower(sound: Path) -> None:
-    held = Trials(sound).where(outcome="success")
-    own = held.where(object_name="3_brick", sample=True)
-    assert own.trial_ids.tolist() == [24, 27, 35]
-    assert held.where(object_name="3_brick", sample=False).trial_ids.tolist() == []
-    assert own[1:].trial_ids.tolist() == [27, 35]
-    assert own[[2, 0]]["trial_id"].tolist() == [35, 24]
-    assert own[own["trial_id"] > 30].trial_ids.tolist() == [35]
-    assert own[-1]["trial_id"] == own[2]["trial_id"] == 35
 
 
 def test_removed_success_is_no_sample(out: Path) -> None:
@@ -188,19 +176,3 @@ def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
     edit_file(out / TRIALS, lambda f: f["trials/object"].write_direct(np.full(36, 3, "i4")))
     with pytest.raises(DataError, match="/trials/object must be 0 to 2, got 3 in row 0"):
         Trials(out)["object_name"]
-
-
-def test_trials_may_be_sent_to_another_process(sound: Path) -> None:
-    held = Trials(sound / TRIALS).where(outcome="success")
-    again = pickle.loads(pickle.dumps(held))
-    assert again.trial_ids.tolist() == held.trial_ids.tolist()
-    assert again[0]["trial_id"] == SUCCESS
-
-
-def test_the_working_directory_may_change(
-    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(sound.parent)
-    trials = Trials(sound.name)
-    monkeypatch.chdir(tmp_path)
-    assert len(trials.columns(("outcome",))["outcome"]) == len(trials)

@@ -66,16 +66,6 @@ def write_hdf5(folder: Path) -> Path:
     return folder / "p.h5"
 
 
-def test_a_file_for_a_score_is_built_by_the_objects_that_it_names(tmp_path):
-    scored = arrays() | {"row": np.array([7, 3]), "confidence": np.array([0.9, 0.1])}
-    np.savez(tmp_path / "p.npz", **scored)
-    assert read_attempts(tmp_path / "p.npz", HAND).objects == tuple(OBJECTS)
-    del scored["object"]
-    np.savez(tmp_path / "p.npz", **scored)
-    with pytest.raises(GraspError, match="must name an `object` in each row, got none"):
-        read_attempts(tmp_path / "p.npz", HAND)
-
-
 def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path):
     """Those of fingers that it leaves out."""
     hand = load_hand("allegro_four")
@@ -472,12 +462,6 @@ def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
     assert not (tmp_path / "ran").exists()
 
 
-def test_pickles_of_the_protocols_of_numpy_are_read(tmp_path):
-    for protocol in (3, 4):
-        write_pickle(tmp_path / f"{protocol}.npy", dexgraspbench(), protocol)
-    np.testing.assert_array_equal(read_attempts(tmp_path, HAND).q_grasp, GRASP[[0, 0]])
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -577,13 +561,6 @@ def test_frame_that_some_rows_lack_is_refused(tmp_path):
     np.savez(tmp_path / "p.npz", **arrays(), frame=["table", ""])
     with pytest.raises(GraspError, match="frame must be the same in all rows"):
         read_attempts(tmp_path / "p.npz", HAND)
-
-
-def test_what_is_not_there_is_refused(tmp_path):
-    with pytest.raises(GraspError, match="postures must be a file or a folder"):
-        read_attempts(tmp_path / "none.npz", HAND)
-    with pytest.raises(GraspError, match=r"must hold \.npy or \.yaml files"):
-        read_attempts(tmp_path, HAND)
 
 
 def test_what_is_missing_is_told(tmp_path):
