@@ -331,7 +331,7 @@ def read_manifest(out: Path) -> Manifest:
     # A missing file gets another message than a broken one.
     try:
         tree, content = read_mapping(path, "a readable manifest")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise DataError(
             f"{out.absolute()}: must be the directory of a dataset, got one without {FILE_NAME}"
         ) from None

@@ -159,6 +159,7 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
         for row, values in zip(rows.tolist(), samples[name], strict=True):
             if not np.isfinite(values).all():
                 raise DataError(f"{out}: {name} of trial {row} must be finite numbers, got others")
+
     conditions = np.column_stack([samples[name] for name in CONDITIONS])
     X_TO, X_OG = (unpack_pose(samples[name]) for name in ("X_TO", "X_OG"))
     for i, row in enumerate(rows.tolist()):

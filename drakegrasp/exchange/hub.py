@@ -183,10 +183,13 @@ def _card(out: Path, tables: Sequence[HubTable], licence: str | None) -> str:
     for table in tables:
         path = f"{table.config}/{table.split}-*.parquet"
         files.setdefault(table.config, []).append({"split": table.split, "path": path})
+
+    # The licences of the meshes, and the samples by split.
     manifest, objects = read_manifest(out), dict[str, list[str]]()
     for entry in manifest.objects:
         objects.setdefault(entry.licence or "not stated", []).append(entry.name)
     splits = (astuple(count) for count in count_splits(out))
+
     head = {
         "license": licence or "unknown",
         "pretty_name": f"Simulated grasps of {counted(len(manifest.objects), 'object')}",
