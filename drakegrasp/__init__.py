@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     )
     from drakegrasp.cluster.connect import connect
     from drakegrasp.config import Config
-    from drakegrasp.dataset.check import check_dataset
-    from drakegrasp.dataset.check_rows import Violation
+    from drakegrasp.dataset.check import Violation, check_dataset
     from drakegrasp.dataset.reader import GraspDataset, Sample
     from drakegrasp.dataset.scenes import SceneDataset
     from drakegrasp.dataset.trials import Trials
@@ -79,7 +78,7 @@ _HOMES = {
     "Score": "scoring.run",
     "Trials": "dataset.trials",
     "Verification": "verification.result",
-    "Violation": "dataset.check_rows",
+    "Violation": "dataset.check",
     "build_dataset": "api.building",
     "check_dataset": "dataset.check",
     "cloud_from_depth": "vision.depth_image",

@@ -785,21 +785,3 @@ def _siblings(place: tuple[Any, ...]) -> list[str]:
     inside = len(place) > 1 and _is_section(place[0])
     section: Any = Config.model_fields[place[0]].annotation if inside else Config
     return list(section.model_fields)
-
-
-def ways_to_grasps(config: Config | None = None) -> str:
-    """Return advice for an object without grasps, with the most helpful measure first.
-
-    Args:
-        config: Configuration of the build, whose settings are not proposed again; None if it is
-            unknown.
-    """
-    ways = []
-    rules = None if config is None else config.candidates
-    if rules is None or ("normals" not in rules.method and rules.postures is None):
-        ways.append("palm poses that face the surface (--set candidates.method=normals)")
-    if config is None or config.objects.resting_poses == 1:
-        ways.append("more resting poses (--set objects.resting_poses=4)")
-    else:
-        ways.append("more palm poses (--candidates)")
-    return ", or ".join([*ways, "another hand (--set hand=NAME)"])

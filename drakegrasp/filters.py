@@ -196,7 +196,7 @@ def _unless(removal: Removal, column: str) -> Rule:
 
 
 #: All filters that judge a success on its own, in their order: the first that rejects it counts.
-#: The columns are those of `dataset.assembly.successes`.
+#: The columns are those of `dataset.successes`.
 RULES = (
     # A grasp vector has a contact for every finger that its preshape uses.
     _unless(Removal.MISSING_FINGER, "complete"),

@@ -68,7 +68,7 @@ def refuse_irregular(path: Path, largest: int | None = None) -> None:
 
 
 def refuse_address(path: str | Path) -> None:
-    """Reject an address, e.g. s3://, as a place to write: it would be a folder `s3:` here.
+    """Reject an address, e.g. s3://, which would be a folder `s3:` here.
 
     Raises:
         DataError: If the path is an address.

@@ -59,7 +59,7 @@ WALLS = {
     "pydrake": (*("hand", "vision", "simulation", "mjcf", "pictures", "verification"),),
     "mujoco": ("mjcf", "hand.draft.mujoco_model", "protocols.scene", "exchange.mjcf"),
     "coacd": ("mjcf.decomposition",),
-    "pyarrow": ("exchange",),
+    "pyarrow": ("exchange.hub",),
     "torch": ("dataset.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.

@@ -15,11 +15,10 @@ from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from helpers.jaws import HAND, box_folder, jaws
 from helpers.objects import box_model
-from helpers.successes import good
+from helpers.successes import good, judge
 
 from drakegrasp import registry
 from drakegrasp.cluster.choice import cluster_of
-from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset, read_closed_grasps
@@ -85,10 +84,10 @@ def test_sampler_draws_palms_that_look_down(tmp_path: Path) -> None:
 def test_rule_removes_what_turned_in_the_hand() -> None:
     turn = np.deg2rad([1.0, 5.0, np.nan])
     filters = load_config("paper", ["filters.own=calm"]).filters
-    removal = judge_successes(good(3).with_columns(turn=turn), filters)
+    removal = judge(good(3).with_columns(turn=turn), filters)
     assert removal.tolist() == [Removal.KEPT, Removal.OWN, Removal.TURNED]
     with pytest.raises(ConfigError, match=r"calm: needs must be some of .*, got turn"):
-        judge_successes(good(3).only("trial_id", "slip"), filters)
+        judge(good(3).only("trial_id", "slip"), filters)
 
 
 def test_protocol_has_numbers_of_its_own(tmp_path: Path) -> None:

@@ -137,8 +137,7 @@ class What:
         manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
             of the meshes]
         postures: Try these postures (wrist and joints) instead of drawn palm poses, on the objects
-            that the postures name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or isaac_grasp
-            .yaml.
+            that the postures name: .npz, .hdf5, DexGraspBench .npy or isaac_grasp .yaml.
         link: Frame or link of the poses in files of postures, which overrides the files: palm, the
             palm link, or a frame of another tool that the hand file names, e.g. graspgen.
         preshape: Preshape for rows of postures that name none; the value each, for palm poses

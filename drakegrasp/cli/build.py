@@ -163,7 +163,8 @@ def print_report(report: BuildReport) -> None:
     """
     from drakegrasp.cli import tables
 
-    tables.print_stats(report.out)
+    if report.assembly is not None:
+        tables.print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
         say(f"{counted(report.simulated, 'work unit')} simulated{reused}")

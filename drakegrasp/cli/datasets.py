@@ -29,8 +29,7 @@ def assemble(
 
     Args:
         out: Directory of the dataset.
-        reject: Trials that must not become samples: the reject.json of an inspection, or a text
-            file with one id per line; # starts a comment.
+        reject: Trials that must not become samples: the reject.json of an inspection.
         overrides: Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may
             be given several times. Your own filters must be given again:
             filters.own=FILE.py:NAME.
@@ -39,9 +38,9 @@ def assemble(
     from drakegrasp.dataset.assemble import assemble as assemble_files
     from drakegrasp.dataset.check import check_hand
     from drakegrasp.dataset.manifest import read_manifest
-    from drakegrasp.dataset.rejections import read_rejected, unused_rejections
+    from drakegrasp.dataset.rejections import read_decisions, unused_rejections
 
-    rejected = () if reject is None else read_rejected(reject)
+    rejected = () if reject is None else sorted(read_decisions(reject).rejected)
     with progress_bar("assemble", "shards") as progress:
         assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
         manifest = read_manifest(out)
@@ -49,7 +48,7 @@ def assemble(
     for sentence in unused_rejections(out, rejected, manifest.rejected):
         say(sentence)
     for changed in check_hand(manifest):
-        say(f"{changed}; the card leaves out its drive, load limit and licence")
+        say(str(changed))
 
 
 def scenes(
@@ -112,8 +111,6 @@ def merge(
 def stats(out: Dataset, /, *, as_json: AsJson = False) -> None:
     """Count outcomes, how well grasps hold, and samples.
 
-    While a build runs, or after it was stopped, the command counts the finished work units.
-
     Args:
         out: Directory of the dataset.
         as_json: Print one document of JSON instead of text.
@@ -128,7 +125,7 @@ def stats(out: Dataset, /, *, as_json: AsJson = False) -> None:
 
 
 def check(
-    path: Annotated[Dataset, Parameter(name="OUT|FILE")],
+    out: Dataset,
     /,
     *,
     workers: Count | None = None,
@@ -139,19 +136,19 @@ def check(
     The exit code is 1 if an invariant is broken.
 
     Args:
-        path: Directory of a dataset, or one of its HDF5 files.
+        out: Directory of the dataset.
         workers: Number of processes on this machine. [default: one per core]
         as_json: Print one document of JSON instead of text.
     """
     with processes(workers, "check", "steps") as how:
-        violations = dg.check_dataset(path, **how)
+        violations = dg.check_dataset(out, **how)
     if as_json:
-        say_json({"path": str(path), "broken": [asdict(violation) for violation in violations]})
+        say_json({"path": str(out), "broken": [asdict(violation) for violation in violations]})
     else:
         for violation in violations:
             say(str(violation))
         found = counted(len(violations), "broken invariant")
-        say(f"{path}: {found if violations else 'no broken invariants'}")
+        say(f"{out}: {found if violations else 'no broken invariants'}")
     if violations:
         sys.exit(1)
 

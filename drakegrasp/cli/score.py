@@ -53,7 +53,7 @@ def score(
 ) -> None:
     """Score predicted grasps against reference rows.
 
-    Each of PREDICTIONS is a .npy, HDF5 or Parquet file of (n, 6k) numbers, one grasp per row of the
+    Each of PREDICTIONS is a .npy or HDF5 file of (n, 6k) numbers, one grasp per row of the
     split, or (n, m, 6k), m grasps per row, in the camera's frame. It may also be a file of postures
     with the `row` of each, or a file or folder of exported samples. Several files are treated as
     several training runs of one method. Without PREDICTIONS only the reference rows are scored.

@@ -15,22 +15,14 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from drakegrasp.cli.console import say
-from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.statistics import (
-    NO_NAME,
     Funnel,
-    PreshapeCount,
     SplitCount,
-    Unfinished,
     count_funnel,
     count_splits,
-    count_unfinished,
     held_note,
     objects_without_samples,
-    preshapes_of,
-    split_shortfall,
 )
 from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
@@ -164,15 +156,6 @@ def hold_table(funnel: Funnel) -> Table:
     return _table_of_objects("How well the hand holds", heads, funnel, row, "\n".join(notes))
 
 
-def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
-    """Return how the attempts of each preshape ended, with one row per preshape."""
-    heads = ("preshape", "attempts", "held", "stable", "samples")
-    rows = ([c.preshape, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
-    nameless = any(count.preshape == NO_NAME for count in counts)
-    caption = f"{NO_NAME}: postures for which all fingers close" if nameless else ""
-    return make_table("Preshapes", heads, rows, caption=caption)
-
-
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with an additional column of objects."""
     heads = ("split", "samples", "distinct", "objects", "classes")
@@ -202,33 +185,11 @@ def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
     return f"split by {rule}: {some} with samples, {objects['test']:,} of them test{valid}"
 
 
-def barren_lines(funnel: Funnel, config: Config) -> list[str]:
+def barren_lines(funnel: Funnel) -> list[str]:
     """Return why objects have no sample: a line for each of the first, and one for the others."""
-    why = [
-        f"no sample of {_safe(name)}: {found.reason}. What may help: {found.advice}"
-        for name, found in objects_without_samples(funnel, config).items()
-    ]
+    why = [f"no sample of {_safe(n)}: {w}" for n, w in objects_without_samples(funnel).items()]
     left = len(why) - BARREN
     return why[:BARREN] + ([f"no sample of {counted(left, 'other object')}"] if left > 0 else [])
-
-
-def unfinished_line(unfinished: Unfinished) -> str:
-    """Return a line on the progress of a build that is running or was stopped."""
-    if unfinished.total is None:
-        units = counted(unfinished.done, "work unit")
-        verb = "is" if unfinished.done == 1 else "are"
-        return f"not finished: {units} {verb} done; samples are chosen at the end"
-    if not unfinished.total:
-        return "not finished: its objects are not prepared yet"
-    if unfinished.done == unfinished.total:
-        return (
-            "all work units are done, but the files are missing or of another state: "
-            "`drakegrasp assemble` writes them"
-        )
-    return (
-        f"not finished: {unfinished.done:,} of {unfinished.total:,} work units are done; "
-        "samples are chosen at the end"
-    )
 
 
 #: Columns of the audit: head, cell, and whether a narrow terminal also shows it.
@@ -364,8 +325,7 @@ def print_table(table: Table) -> None:
 
 def print_stats(out: Path) -> None:
     """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
-    console, unfinished = make_console(), count_unfinished(out)
-    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
+    console, funnel = make_console(), count_funnel(out)
     table = funnel_table(funnel)
     # Rich would truncate numbers in a narrow terminal; the compact table has fewer columns.
     natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
@@ -373,21 +333,11 @@ def print_stats(out: Path) -> None:
         table = funnel_table(funnel, compact=True)
     console.print(table)
     console.print(hold_table(funnel))
-    manifest = read_manifest(out)
-    config, rule = manifest.config, manifest.config.split.by
-    if preshapes := preshapes_of(funnel, config):
-        console.print(preshape_table(preshapes))
     console.print()
-    if unfinished is None:
-        splits = count_splits(out)
-        console.print(split_table(splits))
-        say(split_line(rule, funnel, splits))
-        if line := approach_line(funnel):
-            say(line)
-        for line in barren_lines(funnel, config):
-            say(line)
-        of_benchmark = (out / BUILTIN_FOLDER / BENCHMARK_FILE).is_file()
-        for line in [] if of_benchmark else split_shortfall(splits, rule, config.split):
-            say(line)
-    else:
-        say(f"{out}: {unfinished_line(unfinished)}")
+    splits = count_splits(out)
+    console.print(split_table(splits))
+    say(split_line(read_manifest(out).config.split.by, funnel, splits))
+    if line := approach_line(funnel):
+        say(line)
+    for line in barren_lines(funnel):
+        say(line)

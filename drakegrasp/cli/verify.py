@@ -121,10 +121,10 @@ def verify(
 
     The command reports whether each grasp holds its object, and if not, why.
 
-    GRASPS is a .npy array with one row per grasp, a .csv file with one line per grasp, or an HDF5
-    file with an array `grasps` at its root or in a group. An array `rows` in the same place names
-    the rows of the dataset. A grasp has 6 numbers per finger (18 for the Barrett Hand): the contact
-    points in metres, then the outward unit normals, in the order of the hand's fingers.
+    GRASPS is a .npy array with one row per grasp, or an HDF5 file with an array `grasps` at its
+    root or in a group. An array `rows` in the same place names the rows of the dataset. A grasp has
+    6 numbers per finger (18 for the Barrett Hand): the contact points in metres, then the outward
+    unit normals, in the order of the hand's fingers.
 
     GRASPS may also be a file or a folder of postures, as for `build --postures`. They are tried on
     --object, or on the objects of --dataset that the file specifies by name or by `row`; with
@@ -348,7 +348,7 @@ def _of_mesh(path: Path, target: Target) -> Read:
     Raises:
         GraspError: If no grasp belongs to the object, or the grasps are for rows of a dataset.
     """
-    from drakegrasp.exchange.attempts import read_attempts
+    from drakegrasp.exchange.attempts import read_predictions
     from drakegrasp.objects.sources import find_mesh
     from drakegrasp.simulation.attempts import Attempts
 
@@ -356,7 +356,7 @@ def _of_mesh(path: Path, target: Target) -> Read:
     config = dg.load_config(target.config, target.overrides, **given(hand=target.hand))
     name = find_mesh(target.mesh, units=target.units or "m").name
     hand = dg.load_hand(config.hand_source)
-    table = read_attempts(path, hand, of=name, split=target.split, read_as=target.read_as)
+    table = read_predictions(path, hand, of=name, split=target.split, read_as=target.read_as)
     if table.of_row is not None:
         raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
     if not isinstance(table, Attempts):
@@ -390,7 +390,7 @@ def _of_objects(path: Path, target: Target, dataset: Path) -> Read:
 
 def _of_rows(path: Path, target: Target, dataset: Path) -> Read:
     """Return the grasps of a file for rows of a dataset."""
-    from drakegrasp.exchange.attempts import read_attempts
+    from drakegrasp.exchange.attempts import read_predictions
     from drakegrasp.verification.placing import choose_rows, dataset_config
 
     # For grasps from outside, only the objects and cameras of the rows are needed.
@@ -400,7 +400,7 @@ def _of_rows(path: Path, target: Target, dataset: Path) -> Read:
     own = None if target.config is None else dg.load_config(target.config, target.overrides)
     config = dataset_config(data, own, target.hand, () if own else target.overrides)
     hand = dg.load_hand(config.hand_source)
-    table = read_attempts(path, hand, of=data, read_as=target.read_as)
+    table = read_predictions(path, hand, of=data, read_as=target.read_as)
     if table.of_row is not None:
         target.refuse("with a file that has rows", "rows")
     rows = table.of_row if target.rows is None else _read_rows(target.rows)

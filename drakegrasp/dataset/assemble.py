@@ -1,8 +1,8 @@
-"""From shards to trials.hdf5, grasping_oto.hdf5, grasping_otm.hdf5 and their data card.
+"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
 
-Input: a directory whose work units are all done. Output: the three files, all or none, and their
-card. `assembly.survey` reads the successes and decides which become samples; then the rows go from
-the shards into the files, some thousand at a time. This process keeps a few numbers per success,
+Input: a directory whose work units are all done. Output: the three files, all or none.
+`survey` reads the successes and decides which become samples; then the rows go from the
+shards into the files, some thousand at a time. This process keeps a few numbers per success,
 whatever the number of attempts. It does not import Drake.
 """
 
@@ -22,14 +22,15 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.assembly.samples import IMAGES, sample_values
-from drakegrasp.dataset.assembly.survey import Decisions, ShardRows, Survey, decide, keys_of, survey
-from drakegrasp.dataset.card import card_files, content_of
+from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import (
     COLUMN_CHUNK,
     AnyArray,
     create_field,
+    open_samples,
+    open_trials,
     packed_chunk,
+    read_codes,
     read_columns,
     write_field,
 )
@@ -41,7 +42,6 @@ from drakegrasp.dataset.manifest import (
     read_manifest,
     with_postprocessing,
 )
-from drakegrasp.dataset.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE, model_path
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import (
@@ -55,8 +55,10 @@ from drakegrasp.dataset.schema import (
     Field,
     stored_fields,
 )
-from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, open_shard
+from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard
+from drakegrasp.dataset.survey import Decisions, ShardRows, decide, keys_of, survey
 from drakegrasp.filters import Removal
+from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.environment import available_cores
 from drakegrasp.runtime.files import disk_full_named, new_hdf5, replaced_together, sweep_temporary
@@ -66,6 +68,8 @@ from drakegrasp.vision.camera import intrinsics
 
 #: Rows that are written at once: about ten of the largest shards, 30 MB in memory.
 BLOCK = 8 * COLUMN_CHUNK
+#: Image fields of a sample, copied from /looks as they are stored, and their names there.
+IMAGES = {"images": "image", "masks": "mask"}
 #: Text fields of a sample, and the attributes of its object that they repeat.
 TEXTS = {"object_props/object_name": "name", "object_props/class_name": "class_name"}
 
@@ -125,27 +129,30 @@ def assemble_locked(
     manifest: Manifest,
     *,
     rejected: Sequence[int | AttemptKey] | None = None,
-    surveyed: Survey | None = None,
+    known: Mapping[ShardHeader, Table] | None = None,
+    decisions: Decisions | None = None,
     progress: Report = silent,
 ) -> Assembly:
-    """Write the three files, their card and the manifest; the caller holds the lock.
+    """Write the three files and the manifest; the caller holds the lock.
 
     Args:
         out: Directory of the dataset.
         manifest: Manifest of the dataset; its filters and split may differ from those on disk.
         rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
-        surveyed: Survey of the shards, if there is one; its successes do not depend on the filters.
+        known: The successes of each shard, see `survey`.
+        decisions: What is decided about the successes, if it is decided already.
         progress: As for `assemble`.
     """
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
         # Decide which successes become samples, and in which split.
-        surveyed = surveyed or survey(out, manifest, progress=progress)
-        if rejected is not None:
-            known = keys_of(manifest, surveyed.successes)
-            manifest = replace(manifest, rejected=find_keys(rejected, known, out))
-        decisions = decide(manifest, surveyed)
-        manifest = decisions.manifest
+        if decisions is None:
+            surveyed = survey(out, manifest, known, progress=progress)
+            if rejected is not None:
+                keys = keys_of(manifest, surveyed.successes)
+                manifest = replace(manifest, rejected=find_keys(rejected, keys, out))
+            decisions = decide(manifest, surveyed)
+        manifest, surveyed = decisions.manifest, decisions.survey
 
         # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
@@ -166,11 +173,7 @@ def assemble_locked(
             _write_table(files[""], "successes", SUCCESS_FIELDS, successes)
             _write_rows(out, decisions, files, progress)
 
-        # The card describes the files in words and numbers. The manifest, with filters, split and
-        # rejections, changes together with the files.
-        content = content_of(manifest, paths[""], paths["oto"])
-        for name, text in card_files(content).items():
-            new(name).write_bytes(text)
+        # The manifest, with filters, split and rejections, changes together with the files.
         new(FILE_NAME).write_bytes(manifest_text(manifest))
     return summarise(out)
 
@@ -298,8 +301,8 @@ def _read_block(
     tables, samples = list[Table](), defaultdict[Place, list[_Samples]](list)
     names = [f.name for f in _fields(decisions.manifest, TRIAL_FIELDS)]
     for shard in shards:
-        path, header = shard.header.path(out), shard.header
-        with open_shard(path, header, verify_seal=False, again=True) as (file, _):
+        header = shard.header
+        with open_shard(header.path(out), header, verify_seal=False) as file:
             stored = [name for name in names if name not in ASSEMBLED_FIELDS]
             trials = read_columns(file["trials"], TRIAL_FIELDS, stored)
             trials = trials.with_columns(
@@ -344,6 +347,53 @@ def _samples_of(
         images[name] = [stored.id.read_direct_chunk((k, *_within(stored))) for k in places.tolist()]
     known = {name: trials[name][rows] for name in ASSEMBLED_FIELDS}
     return _Samples(Table(values | known), images)
+
+
+def sample_values(
+    model: ObjectModel, trials: Table, looks: Table, camera: str
+) -> dict[str, AnyArray]:
+    """Return the numbers of n samples of one object, by the names of DATA_FIELDS.
+
+    Args:
+        model: The object.
+        trials: Rows of the samples' trials, with the columns of /trials.
+        looks: Their rows of /looks; images are not needed.
+        camera: `oto` or `otm`.
+    """
+    # Poses of each sample.
+    X_TO = unpack_pose(trials["X_TO"])
+    X_TC = {c: unpack_pose(looks[f"X_TC_{c}"]) for c in CAMERAS}
+    X_CO = multiply(invert_pose(X_TC[camera]), X_TO)
+    R_OC, p_CO = np.swapaxes(X_CO[:, :3, :3], 1, 2), X_CO[:, None, :3, 3]
+
+    # Grasp, palm and forces in the frame of the file's camera. The held grasp is expressed with the
+    # object in its resting pose: both grasps are transformed with X_CO.
+    values: dict[str, AnyArray] = {}
+    for suffix, when, X_OG in (("", "closed", "X_OG"), ("_held", "lifted", "X_OG_lifted")):
+        p_OQ, nhat_Q_O, f_Q_O = (trials[f"{when}_{n}"] for n in ("p_OQ", "nhat_Q_O", "f_Q_O"))
+        vectors = multiply(p_OQ, R_OC) + p_CO, multiply(nhat_Q_O, R_OC)
+        values[f"grasps{suffix}"] = np.concatenate(vectors, axis=1).reshape(trials.count, -1)
+        values[f"grasp_props/X_CG{suffix}"] = pack_pose(multiply(X_CO, unpack_pose(trials[X_OG])))
+        values[f"grasp_props/f_Q_C{suffix}"] = multiply(f_Q_O, R_OC)
+
+    # Frames and mass properties, which do not depend on the camera of the file.
+    R_TO = X_TO[:, :3, :3]
+    R_OT = np.swapaxes(R_TO, 1, 2)
+    I_OOcm_T = multiply(multiply(R_TO, model.I_OOcm_O), R_OT).reshape(-1, 9)
+    properties = {
+        "work2com": multiply(model.p_OOcm[None], R_OT)[:, 0] + X_TO[:, :3, 3],
+        "work2inertia": (trials["mass"] / model.mass)[:, None] * I_OOcm_T,
+        "frame_cam2img_otm": looks["X_CI_otm"],
+        **{f"frame_cam2work_{c}": pack_pose(invert_pose(X)) for c, X in X_TC.items()},
+        **{f"frame_work2cam_{c}": pack_pose(X) for c, X in X_TC.items()},
+        "frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
+        "frame_world2work": np.tile(pack_pose(X_WT), (trials.count, 1)),
+    }
+    values |= {f"object_props/{name}": value for name, value in properties.items()}
+
+    # All other fields are columns of the trial.
+    copied = {f.name: trials[f.of] for f in DATA_FIELDS if trials.has(f.of)}
+    return values | copied | {"object_props/work2mass": trials["mass"][:, None]}
 
 
 def _write_chunks(group: h5py.Group, columns: Table, first: int, pool: ThreadPoolExecutor) -> None:

@@ -1,10 +1,12 @@
 """`drakegrasp check`: are the files of a dataset as they were written, and of one state?
 
-Input: a dataset's directory, or one of the files grasping_oto.hdf5, grasping_otm.hdf5, trials.hdf5
-and scenes.hdf5. Output: a list of violations, empty for a valid dataset. The seal of a file proves
-that it is intact. Besides, attributes, layout and rows are compared with the schema, and samples
-with their trials and meshes. An `Executor` does the work in tasks, each of which reads a file or a
-range of rows. Does not import Drake.
+Input: a dataset's directory. Output: a list of violations, empty for a valid dataset. The seal of a
+file proves that it is intact. Besides, attributes, layout and rows are compared with the schema,
+and samples with their trials and meshes. An `Executor` does the work in tasks, each of which reads
+a file or a range of rows.
+
+The rules of rows come in stages, and a row that breaks a rule is left out of later stages: so the
+check reports a cause, and not everything that follows from it. Does not import Drake.
 """
 
 from __future__ import annotations
@@ -14,33 +16,32 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-import h5py
 import numpy as np
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import file_attributes
-from drakegrasp.dataset.assembly.survey import headers_by_object, known_homes, shards_sha256
-from drakegrasp.dataset.card import card_counts
-from drakegrasp.dataset.check_rows import RowsTask, Violation, check_rows
-from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
-from drakegrasp.dataset.opening import (
+from drakegrasp.dataset.hdf5 import (
     DATA_TABLES,
     OF_CAMERA,
     OF_SCENES,
     ORIGIN,
     SCENE_TABLES,
     TRIAL_TABLES,
-    Kind,
+    AnyArray,
+    Kinds,
     Tables,
     attribute_mistakes,
     differences,
+    open_hdf5,
     open_samples,
+    read_columns,
+    says_damage,
 )
+from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import (
-    CARD_FILES,
     DATA_FILES,
     FILE_NAME,
     SCENES_FILE,
@@ -50,27 +51,38 @@ from drakegrasp.dataset.paths import (
     recorded_model,
     refuse_changed_model,
 )
-from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
+from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader, open_shard
-from drakegrasp.dataset.trials import Trials, stamp
-from drakegrasp.errors import DataError, DrakegraspError, first_line
+from drakegrasp.dataset.survey import headers_by_object, known_homes, shards_sha256
+from drakegrasp.dataset.trials import Stamp, Trials, reopened, stamp
+from drakegrasp.errors import DataError, DrakegraspError, MeshError, first_line, printable
 from drakegrasp.filters import Removal
-from drakegrasp.foreign_files import read_json
+from drakegrasp.frames import (
+    X_WT,
+    Array,
+    invert_pose,
+    pack_pose,
+    rotate_vectors,
+    transform_points,
+    unpack_pose,
+)
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
-from drakegrasp.objects.model import load_object
+from drakegrasp.objects.model import fit_contacts, load_object
+from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import refuse_broken_seal
 from drakegrasp.runtime.progress import Report, silent
-
-__all__ = ["Violation", "check_dataset"]
+from drakegrasp.table import Table
+from drakegrasp.vision.camera import project
 
 #: Number of rows in a task: some 20 MB.
 TASK_ROWS = 1024
-#: Attributes and fields of a file, by the group that only it has.
-KINDS: Mapping[str, tuple[Mapping[str, Kind], Tables]] = {
-    "train": (OF_CAMERA, DATA_TABLES),
-    "trials": (ORIGIN, TRIAL_TABLES),
-    "views": (OF_SCENES, SCENE_TABLES),
+#: Attributes and fields of each file.
+FILES: Mapping[str, tuple[Kinds, Tables]] = {
+    TRIALS_FILE: (ORIGIN, TRIAL_TABLES),
+    **dict.fromkeys(DATA_FILES.values(), (OF_CAMERA, DATA_TABLES)),
+    SCENES_FILE: (OF_SCENES, SCENE_TABLES),
 }
 #: Attributes of the state of a dataset that a file is of, a cause of other differences first;
 #: scenes have the first two.
@@ -79,48 +91,96 @@ STATE = (
     *("config_hash", "seed", "K", "near", "far"),
 )
 
+#: float32 rounds points within one or two metres by 1e-7 m; this leaves room for products.
+POSITION_TOLERANCE = 1e-5  # [m]
+#: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
+UNIT_TOLERANCE = 1e-5
+#: How far a number may be from the number derived again, in units in the last place of the row's
+#: largest value: the last bit may differ between machines.
+LAST_PLACES = 2
+#: A contact on the object's outline may be rounded to a pixel beside the mask, and the collision
+#: mesh and `filters.max_surface_distance` allow it to be off the full mesh.
+MASK_TOLERANCE = 2.0  # [px]
+#: Columns that number the rows of another group, by their group; and columns of codes.
+NUMBERS: Mapping[str, Mapping[str, str]] = {
+    "trials": {"object": "objects"},
+    **{split: {"trial_id": "trials"} for split in SPLITS},
+    "successes": {"trial_id": "trials"},
+    "scenes": {"object": "objects"},
+    "views": {"scene": "scenes"},
+    "grasps": {"scene": "scenes"},
+    "visible": {"view": "views", "grasp": "grasps"},
+}
+CODES: Mapping[tuple[str, str], list[int]] = {
+    ("trials", "outcome"): [each.value for each in Outcome if not each.verification_only],
+    ("successes", "removal"): [each.value for each in Removal],
+}
+#: Groups whose rows have a value in every field from its stage on.
+COMPLETE = ("trials", *SPLITS, "scenes", "views")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Violation:
+    """One broken invariant.
+
+    Attributes:
+        file: Path within the dataset's directory.
+        group: Group or split within the file, e.g. `/train`; empty for the whole file.
+        row: First row of the group that breaks the invariant; None for all of it.
+        more: Number of further rows that break it.
+        what: The invariant in words, with its unit.
+        got: The value of the first row.
+    """
+
+    file: str
+    group: str = ""
+    row: int | None = None
+    more: int = 0
+    what: str
+    got: str
+
+    def __str__(self) -> str:
+        place = f"{self.file} {self.group}".strip()
+        row = "" if self.row is None else f" row {self.row}"
+        more = f" and {self.more:,} more" if self.more else ""
+        return f"{place}{row}{more}: {self.what}, got {self.got}"
+
+
 #: A part of the check that runs in any process.
-Task = Callable[[], list[Violation]]
+Task: TypeAlias = Callable[[], list[Violation]]
 
 
 def check_dataset(
-    path: str | Path, *, execute: Executor = run_here, progress: Report = silent
+    out: str | Path, *, execute: Executor = run_here, progress: Report = silent
 ) -> list[Violation]:
-    """Return every broken invariant of a dataset or of one of its files.
+    """Return every broken invariant of a dataset.
 
     Args:
-        path: Directory of a dataset, or one of its HDF5 files. For a single file, all rules that
-            need no other file are checked.
+        out: Directory of the dataset.
         execute: Executor of the tasks; the result does not depend on it.
         progress: Called with the number of finished tasks and the number of all tasks.
 
     Raises:
-        DataError: If the path is neither, cannot be read, or has another schema. In a directory, a
-            file that cannot be read is a violation, and the other files are still checked.
+        DataError: If there is no dataset, or its manifest cannot be read. Any other file that
+            cannot be read is a violation, and the other files are still checked.
     """
-    path = Path(path)
-    found, tasks = _look_at_dataset(path) if path.is_dir() else _look_at_one(path)
+    found, tasks = _look_at(Path(out))
     for done, more in enumerate(in_order(execute)(_run, tasks), start=1):
         found += more
         progress(done, len(tasks))
-    if path.is_dir() and not found:
-        found += _card(path)  # with other violations, it would differ for the same cause
-    return _joined(found)
 
-
-def _run(task: Task) -> list[Violation]:
-    return task()
-
-
-def _joined(found: Iterable[Violation]) -> list[Violation]:
-    """Return one violation for each rule and group, with the number of all rows that break it."""
+    # One violation for each rule and group, with the number of all rows that break it.
     joined = dict[tuple[str, str, str], Violation]()
     for each in found:
         first = joined.setdefault((each.file, each.group, each.what), each)
         if first is not each:
-            more = first.more + each.more + 1
-            joined[each.file, each.group, each.what] = replace(first, more=more)
+            more_rows = first.more + each.more + 1
+            joined[each.file, each.group, each.what] = replace(first, more=more_rows)
     return list(joined.values())
+
+
+def _run(task: Task) -> list[Violation]:
+    return task()
 
 
 # Files
@@ -131,83 +191,17 @@ class _Look:
     """What the header of a file says.
 
     Attributes:
-        path: Path of the file.
-        tables: Fields of each group.
         counts: Number of rows of each group whose layout is that of the schema.
         attributes: Attributes of the file.
         found: Violations of the layout and of the attributes.
     """
 
-    path: Path
-    tables: Tables
     counts: Mapping[str, int]
     attributes: Mapping[str, Any]
     found: list[Violation]
 
-    def tasks(self, known: Mapping[str, int], dataset: Manifest | None = None) -> Iterator[Task]:
-        """Yield the tasks of the file: its seal, and its rows.
 
-        Args:
-            known: Number of rows of groups of other files.
-            dataset: See `RowsTask`.
-        """
-        yield partial(_seal, self.path)
-        now = stamp(self.path)
-        for group, count in self.counts.items():
-            for start in range(0, count, TASK_ROWS):
-                task = RowsTask(
-                    path=self.path,
-                    stamp=now,
-                    group=group,
-                    rows=slice(start, min(start + TASK_ROWS, count)),
-                    fields=self.tables[group],
-                    attributes=self.attributes,
-                    counts={**known, **self.counts},
-                    dataset=dataset,
-                )
-                yield partial(check_rows, task)
-
-
-def _look_at(path: Path, file: h5py.File, kind: str) -> _Look:
-    """Check the attributes and the layout of a file; no row is read."""
-    kinds, tables = KINDS[kind]
-    mistakes = list(attribute_mistakes(file, kinds))
-    # A group with an invalid column is not read; without sound attributes, nothing is.
-    layout = list(differences(file, tables))
-    broken = {*tables} if mistakes else {each.path[1:].split("/")[0] for each in layout}
-    return _Look(
-        path=path,
-        tables=tables,
-        counts={g: len(file[g][tables[g][0].name]) for g in tables if g not in broken},
-        attributes=dict(file.attrs),
-        found=[
-            Violation(file=path.name, group=each.path, what=each.what, got=each.got)
-            for each in (*mistakes, *layout)
-        ],
-    )
-
-
-def _look_at_one(path: Path) -> tuple[list[Violation], list[Task]]:
-    """Return the violations in the header of a single file, and the tasks of its content."""
-    try:
-        with open_hdf5(path) as file:
-            # The groups tell which of the files it is, whatever its name.
-            kind = next((kind for kind in KINDS if kind in file), None)
-            if kind is None:
-                raise DataError(
-                    f"{path}: must be a data file or the trials of a dataset, got another HDF5 file"
-                )
-            refuse_other_schema(path, file.attrs.get("schema_version"))
-            look = _look_at(path, file, kind)
-    except OSError as error:
-        raise DataError(
-            f"{path}: must be the directory of a dataset or one of its HDF5 files, "
-            f"got one that cannot be read ({first_line(error)})"
-        ) from None
-    return look.found, [*look.tasks({})]
-
-
-def _look_at_dataset(out: Path) -> tuple[list[Violation], list[Task]]:
+def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     """Return what a dataset's manifest and the headers of its files show, and all tasks."""
     manifest, looks = read_manifest(out), dict[str, _Look]()
     found, other, seals = check_hand(manifest), list[Violation](), ""
@@ -218,15 +212,14 @@ def _look_at_dataset(out: Path) -> tuple[list[Violation], list[Task]]:
     with suppress(DataError):
         seals = shards_sha256(out, manifest)
     cameras = {name: camera for camera, name in DATA_FILES.items()}
-    kinds = {TRIALS_FILE: "trials", **dict.fromkeys(cameras, "train")}
-    kinds |= {SCENES_FILE: "views"} if (out / SCENES_FILE).exists() else {}
-    for name, kind in kinds.items():
-        what = "the file must be there, readable and of this schema"
-        with _reported(found, name, what), open_hdf5(out / name) as file:
-            refuse_other_schema(out / name, file.attrs.get("schema_version"))
-            look = looks[name] = _look_at(out / name, file, kind)
-            due = file_attributes(manifest, seals, cameras.get(name, ""))
-            other += _other_state(look, due)
+    for name in FILES:
+        if name == SCENES_FILE and not (out / name).exists():
+            continue
+        with _reported(found, name, "the file must be there, readable and of this schema"):
+            look = looks[name] = _header(out / name)
+            other += _other_state(
+                name, look, file_attributes(manifest, seals, cameras.get(name, ""))
+            )
             found += look.found
 
     # Samples are compared with trials and meshes of the same state.
@@ -237,27 +230,60 @@ def _look_at_dataset(out: Path) -> tuple[list[Violation], list[Task]]:
         for entry, headers in zip(manifest.objects, headers_by_object(manifest), strict=True)
     ]
     for name, look in looks.items():
-        if known and name in cameras:
-            tasks += [partial(_samples, look.path), *look.tasks(known, manifest)]
-        else:
-            tasks += look.tasks({})
+        compared = bool(known) and name in cameras and not look.found
+        if compared:
+            tasks.append(partial(_samples, out / name))
+        tasks.append(partial(_seal, out / name))
+        now, counts = stamp(out / name), {**(known if compared else {}), **look.counts}
+        for group, count in look.counts.items():
+            for start in range(0, count, TASK_ROWS):
+                task = RowsTask(
+                    path=out / name,
+                    stamp=now,
+                    group=group,
+                    rows=slice(start, min(start + TASK_ROWS, count)),
+                    fields=FILES[name][1][group],
+                    attributes=look.attributes,
+                    counts=counts,
+                    dataset=manifest if compared else None,
+                )
+                tasks.append(partial(_check_rows, task))
     return found + other, tasks
 
 
-def _other_state(look: _Look, due: Mapping[str, Any]) -> Iterator[Violation]:
+def _header(path: Path) -> _Look:
+    """Check the attributes and the layout of a file; no row is read."""
+    kinds, tables = FILES[path.name]
+    with open_hdf5(path) as file:
+        refuse_other_schema(path, file.attrs.get("schema_version"))
+        mistakes, layout = list(attribute_mistakes(file, kinds)), list(differences(file, tables))
+        # A group with an invalid column is not read; without sound attributes, nothing is.
+        broken = {*tables} if mistakes else {each.path[1:].split("/")[0] for each in layout}
+        return _Look(
+            counts={g: len(file[g][tables[g][0].name]) for g in tables if g not in broken},
+            attributes=dict(file.attrs),
+            found=[
+                Violation(file=path.name, group=each.path, what=each.what, got=each.got)
+                for each in (*mistakes, *layout)
+            ],
+        )
+
+
+def _other_state(name: str, look: _Look, due: Mapping[str, Any]) -> Iterator[Violation]:
     """The attributes of a file are those of the manifest and of the shards.
 
     Args:
-        look: The file.
+        name: Name of the file.
+        look: Its header.
         due: The attributes that the file would be written with now; `shards` is empty if a shard is
             missing.
     """
-    scenes, of = "views" in look.tables, {"shards": "the shards that are there"}
+    scenes, of = name == SCENES_FILE, {"shards": "the shards that are there"}
     for key in STATE[:2] if scenes else STATE:
         told = key in due and key in look.attributes and (key != "shards" or due[key])
         if told and not np.array_equal(look.attributes[key], due[key]):
             yield Violation(
-                file=look.path.name,
+                file=name,
                 what=f"attribute {key} must be that of {of.get(key, FILE_NAME)}",
                 got=f"another; run `drakegrasp {'scenes' if scenes else 'assemble'}` again",
             )
@@ -282,21 +308,6 @@ def _samples(path: Path) -> list[Violation]:
         if not np.array_equal(np.sort(ids), kept):
             raise DataError(f"they must be {len(kept)}, got {len(ids)}, some of them others")
     return found
-
-
-def _card(out: Path) -> Iterator[Violation]:
-    """The counts of the data card match the files; a dataset may have no card."""
-    path = out / CARD_FILES[0]
-    try:
-        found = read_json(path)["counts"]
-    except FileNotFoundError:
-        return
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        found = first_line(error)
-    if found != card_counts(out):
-        what = "the data card must count what the files hold"
-        got = "others; `drakegrasp assemble` writes it anew"
-        yield Violation(file=path.name, what=what, got=got)
 
 
 # Objects and the hand
@@ -345,3 +356,336 @@ def _reported(found: list[Violation], name: str, what: str) -> Iterator[None]:
     except (DrakegraspError, OSError) as error:
         got = first_line(error).rpartition(", got ")[2]
         found.append(Violation(file=name, what=what, got=got))
+
+
+# Rows
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RowsTask:
+    """Some rows to check, in any process.
+
+    Attributes:
+        path: Path of the file, whose layout is that of the schema.
+        stamp: State of the file, see `drakegrasp.dataset.trials.stamp`.
+        group: Name of the group.
+        rows: Range of the rows.
+        fields: Fields of the group.
+        attributes: Attributes of the file.
+        counts: Number of rows of the groups that the group's rows refer to, as far as known.
+        dataset: Manifest of the dataset around a data file whose samples are compared with their
+            trials and meshes; None to check the rows by themselves.
+    """
+
+    path: Path
+    stamp: Stamp
+    group: str
+    rows: slice
+    fields: tuple[Field, ...]
+    attributes: Mapping[str, Any]
+    counts: Mapping[str, int]
+    dataset: Manifest | None = None
+
+
+#: The words of a rule, the rows (n,) that break it, and what they have instead (n, ...).
+Finding: TypeAlias = tuple[str, AnyArray, AnyArray]
+#: A check of the rows of a task: a table with their columns, without images that have no limits,
+#: and the column NUMBER.
+RowCheck: TypeAlias = Callable[[Table, RowsTask], Iterator[Finding]]
+#: Column of the number of each row in its group; no field has this name.
+NUMBER = "#"
+
+
+def _check_rows(task: RowsTask) -> list[Violation]:
+    """Return the rules that some rows break.
+
+    Raises:
+        DataError: If the path now has another file.
+    """
+    # The seal proves that images are intact, and no rule here is about their colours and depths.
+    names = [f.name for f in task.fields if not (f.sample and f.limits is None)]
+    name, group = task.path.name, f"/{task.group}"
+    with reopened(task.path, task.stamp, "a file of a dataset") as file:
+        try:
+            own = [name for name in names if name in file[task.group]]
+            t = read_columns(file[task.group], task.fields, own, task.rows)
+        except Exception as error:
+            if not says_damage(error):
+                raise
+            what = f"rows {task.rows.start} to {task.rows.stop - 1} must be readable"
+            return [Violation(file=name, group=group, what=what, got=first_line(error))]
+
+    t = t.with_columns({NUMBER: np.arange(task.rows.start, task.rows.stop)})
+    stages: list[list[RowCheck]] = [[_numbers], [_complete, _limits], [_rigid, _derived]]
+    if task.group in SPLITS:
+        stages += [[_chain], [_in_mask]]
+        if task.dataset is not None:
+            stages += [[_of_sample], [_as_in_trials], [_on_mesh]]
+    found = list[Violation]()
+    for checks in stages:
+        sound = np.ones(t.count, dtype=np.bool_)
+        try:
+            findings = [each for check in checks if t.count for each in check(t, task)]
+        except DataError:
+            break  # what it is compared with has a violation of its own
+        for what, bad, got in findings:
+            if bad.any():
+                first = int(np.argmax(bad))
+                found.append(
+                    Violation(
+                        file=name,
+                        group=group,
+                        row=int(t[NUMBER][first]),
+                        more=int(bad.sum()) - 1,
+                        what=what,
+                        got=_said(np.asarray(got)[first]),
+                    )
+                )
+                sound &= ~bad
+        t = t[sound]
+    return found
+
+
+def _said(value: Any) -> str:
+    """Return the value of a row in a line."""
+    number = isinstance(value, float | np.floating)
+    return f"{value:.6g}" if number else printable(" ".join(str(value).split())[:60])
+
+
+def _any(values: AnyArray) -> AnyArray:
+    """Return for each row (n,) whether any of its values (n, ...) is true."""
+    return np.asarray(values.any(axis=tuple(range(1, values.ndim))))
+
+
+def _read_fields(t: Table, task: RowsTask) -> Iterator[Field]:
+    """Yield the fields that were read."""
+    return (f for f in task.fields if t.has(f.name))
+
+
+# What the table of fields says of any group
+
+
+def _numbers(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Numbers of rows are those of rows, and codes have a meaning."""
+    if task.group == "trials":
+        values = t["trial_id"]
+        yield "trial_id must be the number of the row", values != t[NUMBER], values
+    for name, of in NUMBERS.get(task.group, {}).items():
+        values = t[name]
+        bad = _any((values < 0) | (values >= task.counts.get(of, np.inf)))
+        yield f"{name} must be one of the rows of /{of}", bad, values
+    for (place, name), known in CODES.items():
+        if place == task.group:
+            what = f"{name} must be one of {', '.join(map(str, known))}"
+            yield what, ~np.isin(t[name], known), t[name]
+
+
+def _stage(t: Table, task: RowsTask) -> AnyArray:
+    """Return the stage (n,) that each row reached; a sample reached the last one."""
+    if task.group != "trials":
+        return np.full(t.count, Stage.LIFTED.value)
+    stages = {outcome.value: outcome.stage.value for outcome in Outcome}
+    reached = np.array([stages[outcome] for outcome in t["outcome"].tolist()], dtype=int)
+    # The hand can touch the table while it closes, or in the lift.
+    late = (t["outcome"] == Outcome.TABLE_CONTACT) & np.isfinite(t["time_lift"])
+    return np.where(late, Stage.LIFTED.value, reached)
+
+
+def _touching(t: Table, task: RowsTask, field: Field) -> AnyArray:
+    """Return which fingers (n, k) have a contact at the time of a field."""
+    if task.group == "trials":
+        return t["lifted_touching" if "lifted" in field.name else "closed_touching"]
+    return ~unused_fingers(t["grasp_props/unused"], t["grasps"].shape[1] // 6)
+
+
+def _complete(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Fields have values from their stage on, and no values before it."""
+    if task.group not in COMPLETE:
+        return
+    stage = _stage(t, task)
+    for f in _read_fields(t, task):
+        values, reached, since = t[f.name], stage >= f.stage, f.stage.name.lower()
+        if f.derive is not None or f.dtype == "str":
+            continue  # see `_derived`
+
+        # What a value must be depends on its kind.
+        if not f.dtype.startswith("float"):
+            yield (
+                f"{f.name} must be 0 before the stage {since}",
+                ~reached & _any(values != 0),
+                values,
+            )
+        elif f.some:
+            bad = ~reached & _any(~np.isnan(values))
+            yield f"{f.name} must be NaN before the stage {since}", bad, values
+        else:
+            late = f.stage is not Stage.PLACED
+            due, where = reached, f"from the stage {since} on and NaN before" if late else "always"
+            if f.per_finger or f.axes == ("6k",):
+                due = reached[:, None] & _touching(t, task, f)
+                where = "where the finger touches and NaN elsewhere"
+            if f.axes == ("6k",):
+                due = np.tile(np.repeat(due, 3, axis=1), 2)
+            due = due.reshape(*due.shape, *(1,) * (values.ndim - due.ndim))
+            bad = _any(np.where(due, ~np.isfinite(values), ~np.isnan(values)))
+            yield f"{f.name} must be finite {where}", bad, values
+
+
+def _limits(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Values are within the limits of their fields; NaN has no limits."""
+    for f in _read_fields(t, task):
+        if f.limits is not None:
+            # A limit is rounded as the values are: in float32, pi is above its double value.
+            values = t[f.name].reshape(t.count, -1)
+            low, high = (values.dtype.type(limit) for limit in f.limits)
+            positive = f.limits[0] == POSITIVE
+            what = f"above 0..{high:.4g}" if positive else f"{low:g}..{high:.4g}"
+            bad = (values < low) | (values > high) | (positive & (values <= 0))
+            worst = values[range(len(values)), bad.argmax(axis=1)]
+            yield f"{f.name} must be {what}", bad.any(axis=1), worst
+
+
+def _rigid(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Poses are rigid motions, and normals have length one; NaN means that there is no value."""
+    count = t.count
+    for f in _read_fields(t, task):
+        if f.axes[-1:] == (12,):
+            R = unpack_pose(t[f.name].astype(float)).reshape(count, -1, 4, 4)[..., :3, :3]
+            R = np.where(np.isfinite(R).all(axis=(2, 3), keepdims=True), R, np.eye(3))
+            off = np.abs(np.swapaxes(R, 2, 3) @ R - np.eye(3)).max(axis=(1, 2, 3))
+            bad = (off > UNIT_TOLERANCE) | (np.linalg.det(R).min(axis=1) < 0.0)
+            what = f"{f.name} must have an orthonormal rotation with determinant +1"
+            yield what, bad, t[f.name].reshape(count, -1)
+        elif f.axes == ("6k",) or (f.axes == ("k", 3) and "nhat" in f.name):
+            # In a grasp the normals come after the points.
+            n = t[f.name].astype(float).reshape(count, -1, 3)
+            n = n[:, n.shape[1] // 2 :] if f.axes == ("6k",) else n
+            length = np.linalg.norm(n, axis=2)
+            bad = (np.abs(length - 1.0) > UNIT_TOLERANCE).any(axis=1)
+            yield f"normals in {f.name} must have length 1", bad, length
+
+
+def _derived(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Derived fields have the values that the schema derives from other fields."""
+    for f in _read_fields(t, task):
+        if f.derive is not None and t.has(*f.needs):
+            what = f"{f.name} must follow from {', '.join(f.needs)}"
+            yield what, _differs(t[f.name], f.derive(t)), t[f.name]
+
+
+def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) -> AnyArray:
+    """Return (n,) whether values (n, ...) differ from the values derived again.
+
+    Args:
+        values: The stored values.
+        due: The values derived again, of any type.
+        tolerance: Maximum difference of a number; `LAST_PLACES` of rounding if None.
+    """
+    due = due.astype(values.dtype, copy=False).reshape(values.shape)
+    if values.dtype.kind != "f":
+        return _any(values != due)
+    same = (values == due) | (np.isnan(values) & np.isnan(due))
+    size = np.abs(np.where(np.isfinite(due), due, 0.0)).reshape(len(due), -1).max(axis=1)
+    limit = LAST_PLACES * np.spacing(size) if tolerance is None else np.full(len(due), tolerance)
+    with np.errstate(invalid="ignore"):
+        near = np.abs(values - due) <= limit.reshape(-1, *(1,) * (values.ndim - 1))
+    return _any(~(same | near))
+
+
+# What samples are
+
+
+def _pose(t: Table, name: str) -> Array:
+    """Return the poses (n, 4, 4) in a field of `object_props`."""
+    return unpack_pose(t[f"object_props/{name}"].astype(float))
+
+
+def _X_CW(t: Table, task: RowsTask) -> Array:
+    """Return the poses (n, 4, 4) of the world in the frame of the file's camera."""
+    return _pose(t, f"frame_cam2work_{task.attributes['camera']}") @ invert_pose(X_WT)
+
+
+def _contacts(t: Table) -> tuple[Array, Array]:
+    """Return p_CQ [m] and nhat_Q_C, (n, k, 3) each, of the closed hands."""
+    vectors = t["grasps"].astype(float).reshape(t.count, 2, -1, 3)
+    return vectors[:, 0], vectors[:, 1]
+
+
+def _chain(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """The frames of a sample agree: the table, and both cameras with their inverses."""
+    what = f"frame_world2work must be the identity at {X_WT[:3, 3].tolist()} m"
+    apart = {what: _pose(t, "frame_world2work") - X_WT}
+    for camera in CAMERAS:
+        names = f"frame_work2cam_{camera}", f"frame_cam2work_{camera}"
+        X_TC, X_CT = (_pose(t, name) for name in names)
+        apart[f"{names[0]} times {names[1]} must be the identity"] = X_TC @ X_CT - np.eye(4)
+    oto, otm = (_pose(t, f"frame_work2cam_{camera}")[:, :3, 2:] for camera in CAMERAS)
+    apart["both cameras must have the same place and view"] = oto - otm
+    for what, difference in apart.items():
+        off = np.abs(difference).max(axis=(1, 2))
+        yield what, off > POSITION_TOLERANCE, off
+
+
+def _of_sample(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """The trial of a sample is a success that no filter removes."""
+    kept = Trials(task.path.parent)[t["trial_id"]]["removal"] == Removal.KEPT
+    yield "trial_id must be that of a sample", ~kept, t["trial_id"]
+
+
+def _as_in_trials(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """A sample repeats the numbers of its trial, and its poses follow from those of the trial."""
+    copied = {f.name: f.of for f in _read_fields(t, task) if f.of}
+    trials = Trials(task.path.parent)[t["trial_id"]]
+    own = Table(trials.columns([*copied.values(), "X_TO", "X_OG"]))
+    for name, of in copied.items():
+        yield f"{name} must follow from its trial", _differs(t[name], own[of]), t[name]
+
+    X_WO = multiply(X_WT, unpack_pose(own["X_TO"]))
+    X_CG = _X_CW(t, task) @ X_WO @ unpack_pose(own["X_OG"])
+    poses = {"object_props/frame_world2obj": X_WO, "grasp_props/X_CG": X_CG}
+    for name, due in poses.items():
+        bad = _differs(t[name], pack_pose(due), POSITION_TOLERANCE)
+        yield f"{name} must follow from its trial", bad, t[name]
+
+
+def _in_mask(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Contacts are before the camera, and project onto the object in the image."""
+    (p_CQ, _), K = _contacts(t), task.attributes["K"]
+    off = np.zeros(p_CQ.shape[:2])
+    for i, mask in enumerate(t["masks"]):
+        used, seen = np.isfinite(p_CQ[i]).all(axis=1), np.argwhere(mask)[:, ::-1]
+        apart = np.linalg.norm(project(K, p_CQ[i, used])[:, None] - seen, axis=2)
+        off[i, used] = apart.min(axis=1, initial=np.inf)
+    off[p_CQ[..., 2] <= 0.0] = np.inf
+    what = f"contacts must project within {MASK_TOLERANCE:g} px of the mask"
+    yield what, np.any(off > MASK_TOLERANCE, axis=1), off
+
+
+def _on_mesh(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Contacts are on the object's mesh, and their normals point out of it.
+
+    A normal counts as outward if it agrees with either of the faces of `ContactFit.normal_angle`.
+    """
+    assert task.dataset is not None
+    limit = task.dataset.config.filters.max_surface_distance
+    X_OC = invert_pose(_X_CW(t, task) @ _pose(t, "frame_world2obj"))
+    p_CQ, nhat_Q_C = _contacts(t)
+    off, angle = np.zeros((2, *p_CQ.shape[:2]))
+
+    # Object by object.
+    names = t["object_props/object_name"]
+    for name in np.unique(names.astype(str)).tolist():
+        try:
+            model = load_object(model_path(task.path.parent, name))
+        except (DataError, MeshError):
+            continue  # a violation of the object's files
+        for i in np.flatnonzero(names == name).tolist():
+            p_OQ = transform_points(X_OC[i], p_CQ[i])
+            fit = fit_contacts(model, p_OQ, rotate_vectors(X_OC[i], nhat_Q_C[i]))
+            off[i], angle[i] = fit.distance, np.degrees(fit.normal_angle)
+
+    beyond = off > limit + POSITION_TOLERANCE
+    what = f"contacts must be on the object's mesh within {limit:g} m"
+    yield what, beyond.any(axis=1), off
+    what = "normals must point out of the object, within 90 deg of its face's"
+    yield what, ((angle > 90.0) & ~beyond).any(axis=1), angle

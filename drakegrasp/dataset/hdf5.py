@@ -1,4 +1,9 @@
-"""HDF5 files of a dataset: opening a file, writing a field, reading rows of images fast.
+"""HDF5 files of a dataset: opened, compared with the schema, read and written.
+
+Input: a path, or an open file and the fields of its groups. Output: an open file that contains
+every group, dataset and attribute of the schema with its type and shape, or every `Difference`; its
+columns. Commands reject a file at the first difference, and `drakegrasp check` lists all of them.
+Imports only NumPy and h5py.
 
 HDF5 spends most of the time of reading an image on decompression. libdeflate is four times as fast,
 with the same result; it is used if the package `deflate` is installed.
@@ -7,15 +12,34 @@ with the same result; it is used if the package `deflate` is installed.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
-from drakegrasp.dataset.schema import Field
+from drakegrasp.dataset.schema import (
+    CAMERAS,
+    DATA_FIELDS,
+    LETTERS,
+    OBJECT_FIELDS,
+    SCENE_FIELDS,
+    SCENE_GRASP_FIELDS,
+    SCENE_OBJECT_FIELDS,
+    SPLITS,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    VIEW_FIELDS,
+    VISIBLE_FIELDS,
+    Field,
+    refuse_other_schema,
+)
 from drakegrasp.errors import DataError, first_line, printable
-from drakegrasp.foreign_files import NAME_RULE, is_name, refuse_irregular
+from drakegrasp.foreign_files import parse_json, refuse_irregular
 from drakegrasp.table import AnyArray as AnyArray
 from drakegrasp.table import Table
 
@@ -30,6 +54,24 @@ MOST_PACKED = 1_032
 GZIP_LEVEL = 1
 #: Number of rows in a chunk of a column of small values.
 COLUMN_CHUNK = 2048
+#: Fields of each group of a file, by the group's name.
+Tables = Mapping[str, tuple[Field, ...]]
+DATA_TABLES: Tables = {split: DATA_FIELDS for split in SPLITS}
+TRIAL_TABLES: Tables = {
+    "objects": OBJECT_FIELDS,
+    "trials": TRIAL_FIELDS,
+    "successes": SUCCESS_FIELDS,
+}
+SCENE_TABLES: Tables = {
+    "objects": SCENE_OBJECT_FIELDS,
+    "scenes": SCENE_FIELDS,
+    "views": VIEW_FIELDS,
+    "grasps": SCENE_GRASP_FIELDS,
+    "visible": VISIBLE_FIELDS,
+}
+
+
+# Files
 
 
 def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
@@ -116,6 +158,203 @@ def _find_elsewhere(file: h5py.File) -> str | None:
     return None
 
 
+@contextmanager
+def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]:
+    """Open an HDF5 file while the block runs; HDF5 errors in the block become a DataError.
+
+    Args:
+        path: Path of the file.
+        what: What the file must be, in words.
+        again: See `open_hdf5`.
+
+    Raises:
+        DataError: If the file is missing or damaged.
+    """
+    if path.is_dir():
+        raise DataError(f"{path}: must be {what}, got a folder; name the file in it")
+    try:
+        with open_hdf5(path, again=again) as file:
+            yield file
+    except DataError:
+        raise
+    except Exception as error:
+        if not says_damage(error):
+            raise
+        raise DataError(f"{path}: must be {what}, got none ({first_line(error)})") from None
+
+
+class Difference(NamedTuple):
+    """A difference between a file and the schema.
+
+    Attributes:
+        path: Path of the group or the dataset; empty for the whole file.
+        what: What the file must have there, in words.
+        got: What the file has there instead.
+    """
+
+    path: str
+    what: str
+    got: str
+
+    def __str__(self) -> str:
+        return f"{self.path + ': ' if self.path else ''}{self.what}, got {self.got}"
+
+
+# Attributes
+
+
+def _is_json(value: Any, kind: type) -> bool:
+    try:
+        return type(parse_json(value)) is kind
+    except (TypeError, ValueError):
+        return False
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable()
+
+
+#: What an attribute must be, in words, and whether a value is.
+_KINDS: Mapping[str, Callable[[Any], bool]] = {
+    "a text": _is_text,
+    "a mapping in JSON": lambda value: _is_text(value) and _is_json(value, dict),
+    "a list in JSON": lambda value: _is_text(value) and _is_json(value, list),
+    "a whole number that is not negative": lambda v: isinstance(v, np.integer) and bool(v >= 0),
+    "a positive number": lambda value: isinstance(value, np.floating) and bool(value > 0.0),
+    "a matrix of 3 x 3 numbers": lambda value: (
+        isinstance(value, np.ndarray) and value.shape == (3, 3) and value.dtype.kind == "f"
+    ),
+    "one of oto, otm": lambda value: isinstance(value, str) and value in CAMERAS,
+    "one of class, object": lambda value: isinstance(value, str) and value in ("class", "object"),
+}
+#: Kinds of attributes by their names.
+Kinds = Mapping[str, str]
+#: Attributes of all three files.
+ORIGIN: Kinds = {
+    **dict.fromkeys(("config", "versions", "fingers"), "a mapping in JSON"),
+    **dict.fromkeys(("config_hash", "signature", "shards"), "a text"),
+    "joints": "a list in JSON",
+    "seed": "a whole number that is not negative",
+    "K": "a matrix of 3 x 3 numbers",
+    "near": "a positive number",
+    "far": "a positive number",
+}
+#: Attributes of the data files.
+OF_CAMERA: Kinds = {**ORIGIN, "camera": "one of oto, otm", "split_by": "one of class, object"}
+#: Attributes of scenes.hdf5, whose views have their own camera matrices.
+OF_SCENES: Kinds = {key: kind for key, kind in ORIGIN.items() if key != "K"}
+
+
+def attribute_mistakes(file: h5py.File, kinds: Kinds) -> Iterator[Difference]:
+    """Yield the attributes of a file that are missing or hold something else."""
+    for key, kind in kinds.items():
+        value = file.attrs.get(key)
+        if not _KINDS[kind](value):
+            got = printable(" ".join(repr(value).split())[:60]) if key in file.attrs else "none"
+            yield Difference("", f"attribute {key} must be {kind}", got)
+
+
+@contextmanager
+def _opened_whole(path: Path, what: str, kinds: Kinds, tables: Tables) -> Iterator[h5py.File]:
+    """Open a file, see `opened`, and reject it if it differs from the schema."""
+    with opened(path, what) as file:
+        # Check the version first: another version may have other attributes, and a foreign file
+        # has none.
+        if "schema_version" not in file.attrs:
+            raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
+        refuse_other_schema(path, file.attrs["schema_version"])
+        refuse_first(path, attribute_mistakes(file, kinds))
+        refuse_first(path, differences(file, tables))
+        yield file
+
+
+#: Context managers that open a file of a dataset, given its path: grasping_oto.hdf5 or
+#: grasping_otm.hdf5, trials.hdf5, scenes.hdf5. They raise a DataError if the file is missing,
+#: damaged, or differs from the schema.
+open_samples, open_trials, open_scenes = (
+    partial(_opened_whole, what=what, kinds=kinds, tables=tables)
+    for what, kinds, tables in (
+        ("a data file of drakegrasp", OF_CAMERA, DATA_TABLES),
+        ("the trials of a dataset", ORIGIN, TRIAL_TABLES),
+        ("the scenes of a dataset", OF_SCENES, SCENE_TABLES),
+    )
+)
+
+
+def refuse_first(path: Path, mistakes: Iterable[object]) -> None:
+    """Reject a file that has any mistake; the error reports the first one.
+
+    Raises:
+        DataError: If there is a mistake.
+    """
+    if (first := next(iter(mistakes), None)) is not None:
+        raise DataError(f"{path}: {printable(str(first))}")
+
+
+# Groups and datasets
+
+
+def differences(file: h5py.File, tables: Tables) -> Iterator[Difference]:
+    """Yield the differences between the groups and datasets of a file and their fields.
+
+    The first dataset of a group tells the number of its rows, and the first field with a letter in
+    its shape the length of this letter in the file.
+    """
+    lengths: dict[str, int] = {}
+    for name, fields in tables.items():
+        group, place, rows = file.get(name), f"/{name}", None
+        if not isinstance(group, h5py.Group):
+            yield Difference(place, "the group must be there", "none")
+            continue
+        for f in fields:
+            path, found = f"{place}/{f.name}", _dataset(group, f.name)
+            if found is None:
+                if not f.optional or f.name in group:
+                    yield Difference(path, "the dataset must be there", "none")
+                continue
+
+            # Its type, and its shape.
+            dtype, shape = found.dtype, found.shape
+            text = h5py.check_string_dtype(dtype) is not None
+            if text != (f.dtype == "str") or not (text or dtype == np.dtype(f.dtype)):
+                yield Difference(path, f"type must be {f.dtype}", str(dtype))
+            rows = shape[0] if rows is None and shape else rows
+            lengths = {**_letters_in(f, shape), **lengths}
+            due = (rows or 0, *f.row_shape({**dict.fromkeys(LETTERS, 0), **lengths}))
+            if shape != due:
+                yield Difference(path, f"shape must be {due}", str(shape))
+
+
+def _dataset(group: h5py.Group, name: str) -> h5py.h5d.DatasetID | None:
+    """Return a dataset of a group, or None; much faster than `group[name]`."""
+    try:
+        item = h5py.h5o.open(group.id, name.encode())
+    except KeyError:
+        return None
+    return item if isinstance(item, h5py.h5d.DatasetID) else None
+
+
+def _letters_in(field: Field, shape: tuple[int, ...] | None) -> dict[str, int]:
+    """Return the lengths of the letters in a field's shape, given the shape of its dataset."""
+    if shape is None or len(shape) != 1 + len(field.axes):
+        return {}
+    axes = zip(field.axes, shape[1:], strict=True)
+    found = {axis: length for axis, length in axes if isinstance(axis, str)}
+    return {"k": found["6k"] // 6} if "6k" in found else found
+
+
+def sizes_in(group: h5py.Group, fields: Iterable[Field]) -> dict[str, int]:
+    """Return the lengths of the letters in the shapes of the fields that a group has."""
+    found: dict[str, int] = {}
+    for field in fields:
+        if any(isinstance(axis, str) for axis in field.axes) and field.name in group:
+            found |= _letters_in(field, group[field.name].shape)
+    return found
+
+
+# Columns
+
+
 def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:
     """Return the texts of a dataset for display: all are printable, so none controls a terminal.
 
@@ -131,19 +370,6 @@ def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:
         if not text.isprintable():
             raise DataError(f"{path}: a name must be printable, got {text!r}")
     return texts
-
-
-def read_names(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the names of objects in a dataset of texts; they may become names of files.
-
-    Raises:
-        DataError: If one of them is not a valid name.
-    """
-    names = read_texts(dataset)
-    for name in names:
-        if not is_name(name):
-            raise DataError(f"{dataset.file.filename}: a name must be {NAME_RULE}, got {name!r}")
-    return names
 
 
 def read_columns(
@@ -198,14 +424,44 @@ def _stored(group: h5py.Group, name: str, rows: slice, *, text: bool = False) ->
     return values
 
 
-def sizes_in(group: h5py.Group, fields: Iterable[Field]) -> dict[str, int]:
-    """Return the lengths of the letters in the shapes of the fields that a group has."""
-    found: dict[str, int] = {}
-    for field in fields:
-        if any(isinstance(axis, str) for axis in field.axes) and field.name in group:
-            axes = zip(field.axes, group[field.name].shape[1:], strict=False)
-            found |= {axis: length for axis, length in axes if isinstance(axis, str)}
-    return {"k": found["6k"] // 6, **found} if "6k" in found else found
+def read_codes(
+    dataset: h5py.Dataset, codes: int | Sequence[int], rows: slice = slice(None)
+) -> npt.NDArray[Any]:
+    """Return a column (n,) of codes, and reject codes without a defined meaning.
+
+    Args:
+        dataset: The column.
+        codes: The number of valid codes, which are counted from 0, or the valid codes themselves.
+        rows: The rows that are read.
+
+    Raises:
+        DataError: If a code has no defined meaning.
+    """
+    values: npt.NDArray[Any] = dataset[rows]
+    path = Path(dataset.file.filename)
+    refuse_other_codes(path, dataset.name, values, codes, rows.start or 0)
+    return values
+
+
+def refuse_other_codes(
+    path: Path,
+    name: str,
+    values: npt.NDArray[Any],
+    codes: int | Sequence[int],
+    first: int = 0,
+) -> None:
+    """Reject codes without a defined meaning, see `read_codes`; `first` is the first row.
+
+    Raises:
+        DataError: If there is such a code.
+    """
+    if isinstance(codes, int):
+        bad, must = (values < 0) | (values >= codes), f"0 to {codes - 1}"
+    else:
+        bad, must = ~np.isin(values, codes), f"one of {', '.join(str(int(c)) for c in codes)}"
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DataError(f"{path}: {name} must be {must}, got {values[row]} in row {first + row}")
 
 
 def create_field(

@@ -47,13 +47,13 @@ def read_mapping(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
         what: Description of a valid file, for the message.
 
     Raises:
-        FileNotFoundError: If there is no such file.
+        FileNotFoundError, NotADirectoryError: If there is no such file.
         DataError: If the file cannot be read, or is not a JSON mapping.
     """
     try:
         content = read_content(path, LARGEST_TEXT)
         tree = parse_json(content)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise
     except (OSError, ValueError) as error:
         got = f"a broken one ({printable(one_line(error))})"

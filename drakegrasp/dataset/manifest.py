@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
@@ -32,7 +31,6 @@ from drakegrasp.config import (
     Share,
     parse_stored,
 )
-from drakegrasp.dataset.assembly.split import Home
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, unwritable
 from drakegrasp.dataset.paths import FILE_NAME
@@ -43,6 +41,7 @@ from drakegrasp.dataset.schema import (
     refuse_other_schema,
 )
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.split import Home
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
@@ -309,7 +308,7 @@ def read_manifest(out: Path) -> Manifest:
     # A missing file gets another message than a broken one.
     try:
         tree, content = read_mapping(path, "a readable manifest")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise DataError(
             f"{out.absolute()}: must be the directory of a dataset, got one without {FILE_NAME}"
         ) from None
@@ -328,9 +327,7 @@ def read_manifest(out: Path) -> Manifest:
         config=config.with_hand(config.hand, carried),
         **{f.name: getattr(stored, f.name) for f in fields(Manifest) if f.name != "config"},
     )
-    if (mistake := next(_contradictions(stored, manifest), None)) is not None:
-        raise DataError(f"{path}: {mistake}")
-    # What remains is a valid value that was changed. Older manifests have no digest.
+    # What remains is a valid value that was changed.
     if stored.sha256 not in (None, _digest(tree)):
         raise DataError(
             f"{path}: must be as it was written, got one with another {DIGEST}: it is damaged, or "
@@ -354,23 +351,6 @@ class _Stored(BaseModel):
     refused: tuple[RefusedMesh, ...]
     rejected: tuple[AttemptKey, ...] = ()
     sha256: Hex | None = None
-
-
-def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
-    """Yield the contradictions within a manifest, in words."""
-    config = manifest.config
-    for key, said, must in (
-        ("config_hash", stored.config_hash, config.simulation_hash()),
-        ("seed", stored.seed, config.seed),
-    ):
-        if said != must:
-            yield f"{key} must be {must}, that of its config, got {said}"
-    if stored.split_by != config.split.by:
-        yield f"split_by must be {config.split.by}, that of its config, got {stored.split_by}"
-
-    for name, count in Counter(entry.name for entry in stored.objects).items():
-        if count > 1:
-            yield f"objects must have a name each, got {name!r} twice"
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:

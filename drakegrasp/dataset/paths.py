@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from drakegrasp.dataset.opening import opened, refuse_other_plan
+from drakegrasp.dataset.hdf5 import opened
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import NAME_RULE, is_name, read_content
@@ -18,8 +18,6 @@ SCENES_FILE = "scenes.hdf5"
 FILE_NAME = "manifest.json"
 #: Files that `assemble` writes; they always belong to one state.
 ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
-#: Data cards that describe the dataset, for programs and for people.
-CARD_FILES = ("DATACARD.json", "DATACARD.md")
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
 #: File in this folder in which the frozen benchmark describes itself.
@@ -78,7 +76,6 @@ def recorded_model(out: Path, name: str) -> str:
     path = plan_path(out, name)
     refuse_broken_seal(path, "plan of an object")
     with opened(path, "the plan of an object") as file:
-        refuse_other_plan(path, file)
         return str(file.attrs["model_sha256"])
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 
 import h5py
@@ -17,14 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.hdf5 import AnyArray
+from drakegrasp.dataset.hdf5 import AnyArray, opened
 from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry
-from drakegrasp.dataset.opening import (
-    PLAN_TABLES,
-    POSTURE_FIELDS,
-    POSTURE_PRESHAPES,
-    opened,
-)
 from drakegrasp.dataset.paths import (
     model_file_sha256,
     model_path,
@@ -32,7 +25,7 @@ from drakegrasp.dataset.paths import (
     recorded_model,
     refuse_changed_model,
 )
-from drakegrasp.errors import DataError, one_line
+from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
@@ -45,6 +38,23 @@ _OF_MODEL = (
     *("name", "class_name", "mesh_sha256", "scale", "up", "mass", "density", "friction"),
     *("collision_error", "notes"),
 )
+#: Arrays of a plan and their types: resting poses; palm poses; postures from outside, which are as
+#: many as the palm poses.
+_RESTING = {
+    "X_TO": "float64",
+    "probability": "float64",
+    "table_force": "float64",
+    "stopped": "bool",
+}
+_PALMS = {
+    "X_OG": "float64",
+    "distance": "float64",
+    "resting": "int64",
+    "source": "int64",
+    "spread": "float64",
+    "preshape_index": "int64",
+}
+_POSTURES = {**dict.fromkeys(("q_grasp", "q_pregrasp", "q_squeeze"), "float64"), "row": "int64"}
 #: Fields of the entry that change when more palm poses are drawn.
 _DRAWN = ("candidates", "ended")
 
@@ -116,18 +126,18 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         file.attrs["mesh_sha256"] = model.mesh_sha256
         file.attrs["asked"] = prepared.asked
         arrays = {**vars(candidates), **vars(prepared), "X_TO": prepared.resting_poses}
-        for field in chain(*PLAN_TABLES):
-            file.create_dataset(field.name, data=arrays[field.name], dtype=field.dtype)
+        for name, dtype in {**_RESTING, **_PALMS}.items():
+            file.create_dataset(name, data=arrays[name], dtype=dtype)
         if candidates.postures is not None:
             _save_postures(candidates.postures, file)
 
 
 def _save_postures(postures: Table, file: h5py.File) -> None:
     """Write the columns of the postures; their preshapes are stored as JSON."""
-    for field in POSTURE_FIELDS:
-        file.create_dataset(field.name, data=postures[field.name], dtype=field.dtype)
+    for name, dtype in _POSTURES.items():
+        file.create_dataset(name, data=postures[name], dtype=dtype)
     texts = json.dumps(postures.preshape.tolist()).encode()
-    file.create_dataset(POSTURE_PRESHAPES.name, data=np.frombuffer(texts, dtype=np.uint8))
+    file.create_dataset("preshape", data=np.frombuffer(texts, dtype=np.uint8))
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
@@ -143,9 +153,8 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     refuse_changed_model(out, name, recorded_model(out, name))
     with opened(path, "the plan of an object") as file:
         attributes = dict(file.attrs)
-        resting, palms = ({f.name: file[f.name][:] for f in fields} for fields in PLAN_TABLES)
-        names = [field.name for field in (*POSTURE_FIELDS, POSTURE_PRESHAPES)]
-        given = {name: file[name][:] for name in names if name in file}
+        resting, palms = ({name: file[name][:] for name in names} for names in (_RESTING, _PALMS))
+        given = {name: file[name][:] for name in (*_POSTURES, "preshape") if name in file}
     due = config.simulation_hash()
     if attributes["config_hash"] != due:
         raise DataError(f"{path}: must be of configuration {due}, got {attributes['config_hash']}")
@@ -153,17 +162,14 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
         model=load_object(model_path(out, name)),
         resting_poses=resting.pop("X_TO"),
         **resting,
-        candidates=Candidates(**palms, postures=_given_postures(given, path)),
+        candidates=Candidates(**palms, postures=_given_postures(given)),
         asked=int(attributes["asked"]),
     )
 
 
-def _given_postures(arrays: dict[str, AnyArray], path: Path) -> Table | None:
+def _given_postures(arrays: dict[str, AnyArray]) -> Table | None:
     """Return the postures of a plan, or None if its palm poses come from samplers."""
     if not arrays:
         return None
-    try:
-        preshape = np.array(list(map(str, parse_json(arrays.pop("preshape").tobytes()))), dtype=str)
-        return Table({**arrays, "preshape": preshape})
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path}: must hold postures, got none: {one_line(error)}") from None
+    preshape = np.array(parse_json(arrays.pop("preshape").tobytes()), dtype=str)
+    return Table({**arrays, "preshape": preshape})

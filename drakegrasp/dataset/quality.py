@@ -70,53 +70,26 @@ def _shown(name: str) -> Shown:
 #: The scales are the limits of `filters` in the preset `paper`, if it has a limit. The others are
 #: values that 5 % of the stable grasps on 29 objects exceed (penetration; the sum of normals: 1.6
 #: for three fingers), or that none of them exceeds (imbalance).
+# fmt: off
 PARTS = (
-    Part(
-        "penetration",
-        4e-3,
-        Shown("penetration", "mm"),
-        "largest depth of the object in a fingertip",
-        Stage.CLOSED,
-    ),
+    Part("penetration", 4e-3, Shown("penetration", "mm"),
+         "largest depth of the object in a fingertip", Stage.CLOSED),
     Part("slip", 0.010, _shown("slip"), "motion of the object in the hand during the lift"),
-    Part(
-        "turn",
-        float(np.deg2rad(10.0)),
-        _shown("turn"),
-        "rotation of the object in the hand during the lift",
-    ),
-    Part(
-        "normal_angle",
-        float(np.deg2rad(30.0)),
-        _shown("normal_angle"),
-        "largest angle of a contact's normal from the mesh's",
-    ),
-    Part(
-        "surface_distance",
-        2e-3,
-        _shown("surface_distance"),
-        "largest distance of a contact's centre from the mesh: contact on an edge",
-    ),
-    Part(
-        "other_links",
-        1.0,
-        Shown("other links", digits=0),
-        "other links that touch the object after the lift",
-    ),
-    Part(
-        "imbalance",
-        0.05,
-        Shown("force imbalance", digits=3),
-        "fingertips' forces and weight after the lift, as a share of the weight",
-    ),
-    Part(
-        "normal_sum",
-        0.54,
-        Shown("sum of normals", digits=2),
-        "length of the sum of the contact normals after closing, per finger that grasps",
-        Stage.CLOSED,
-    ),
+    Part("turn", float(np.deg2rad(10.0)), _shown("turn"),
+         "rotation of the object in the hand during the lift"),
+    Part("normal_angle", float(np.deg2rad(30.0)), _shown("normal_angle"),
+         "largest angle of a contact's normal from the mesh's"),
+    Part("surface_distance", 2e-3, _shown("surface_distance"),
+         "largest distance of a contact's centre from the mesh: contact on an edge"),
+    Part("other_links", 1.0, Shown("other links", digits=0),
+         "other links that touch the object after the lift"),
+    Part("imbalance", 0.05, Shown("force imbalance", digits=3),
+         "fingertips' forces and weight after the lift, as a share of the weight"),
+    Part("normal_sum", 0.54, Shown("sum of normals", digits=2),
+         "length of the sum of the contact normals after closing, per finger that grasps",
+         Stage.CLOSED),
 )
+# fmt: on
 
 #: Columns of `/trials` that `suspicion` reads.
 COLUMNS = (

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import operator
 import os
-import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -22,12 +21,18 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, read_columns, says_damage, write_field
-from drakegrasp.dataset.opening import open_samples
-from drakegrasp.dataset.remote import local_file
+from drakegrasp.dataset.hdf5 import (
+    ImageRows,
+    open_hdf5,
+    open_samples,
+    read_columns,
+    says_damage,
+    write_field,
+)
 from drakegrasp.dataset.schema import DATA_FIELDS, PREDICTED_ROW_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line
-from drakegrasp.grasp import unpack_grasp, unused_fingers
+from drakegrasp.foreign_files import refuse_address
+from drakegrasp.grasp import unused_fingers
 
 if TYPE_CHECKING:
     from drakegrasp.dataset.torch_samples import TorchSamples
@@ -38,7 +43,7 @@ FIELDS = {field.name: field for field in DATA_FIELDS}
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Sample:
-    """One grasp with the image of its camera; `print` shows it on one screen.
+    """One grasp with the image of its camera.
 
     Attributes:
         image: (4, S, S) float32: R, G, B in 0..1 and depth [m].
@@ -74,13 +79,6 @@ class Sample:
             f"{self.dataset.path.name}, trial {self.trial_id})"
         )
 
-    def __str__(self) -> str:
-        lines = (
-            textwrap.fill(text, 100, initial_indent=f"  {name:<13}", subsequent_indent=15 * " ")
-            for name, text in _lines_of(self)
-        )
-        return "\n".join([repr(self), *lines])
-
 
 class GraspDataset:
     """One split of a data file as a sequence of samples.
@@ -90,8 +88,7 @@ class GraspDataset:
     because its rows may differ. `to_torch` returns tensors for torch's DataLoader.
 
     Args:
-        path: `grasping_oto.hdf5` or `grasping_otm.hdf5`, or its address in an object store, see
-            `dataset.remote`.
+        path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
         split: `train`, `valid` or `test`.
         fewer_fingers: Whether to read a split in which some grasps leave fingers out. The contacts
             of these fingers are NaN and must not enter training unnoticed, so such a split is
@@ -119,7 +116,8 @@ class GraspDataset:
     ) -> None:
         if split not in SPLITS:
             raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-        self.path, self.split = local_file(path), split
+        refuse_address(path)
+        self.path, self.split = Path(path).absolute(), split
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
         self._process = -1
@@ -318,31 +316,6 @@ def _refuse_other_fields(names: Sequence[str]) -> None:
     for name in names:
         if name not in FIELDS:
             raise DataError(f"field must be one of {', '.join(FIELDS)}, got {name!r}")
-
-
-def _lines_of(sample: Sample) -> Iterator[tuple[str, str]]:
-    """Yield names and texts that describe a sample: shapes and main values."""
-    depth = sample.image[3]
-    yield "image", f"{sample.image.shape} float32, depth {depth.min():.3f} to {depth.max():.3f} m"
-    yield "mask", f"{sample.mask.shape} uint8, {np.count_nonzero(sample.mask):,} px of the object"
-
-    # Contacts by finger.
-    points, normals = unpack_grasp(sample.grasp)
-    yield "grasp", f"{sample.grasp.shape} float32, p_CQ [m] and nhat_Q_C of each finger:"
-    for point, normal in zip(points, normals, strict=True):
-        yield "", "  ".join(" ".join(f"{x:7.4f}" for x in vector) for vector in (point, normal))
-    yield "grasp_held", f"{sample.grasp_held.shape} float32, the same after the lift"
-
-    # In groups, single numbers and texts are shown by value, arrays by shape.
-    for name in ("grasp_props", "props", "conditions"):
-        values = sorted(getattr(sample, name).items(), key=lambda item: np.ndim(item[1]) > 0)
-        yield name, ", ".join(_said(key, value) for key, value in values)
-
-
-def _said(key: str, value: Any) -> str:
-    if np.ndim(value):
-        return f"{key} {np.shape(value)}"
-    return f"{key} {value:.3g}" if isinstance(value, np.floating) else f"{key} {value}"
 
 
 def _group(values: dict[str, Any], prefix: str) -> dict[str, Any]:

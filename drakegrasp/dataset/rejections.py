@@ -1,9 +1,8 @@
-"""Decisions of an inspection: `reject.json`, and text files that list trials.
+"""Decisions of an inspection: `reject.json`.
 
 `drakegrasp inspect` writes `reject.json` into a dataset's directory, a new file for every decision;
 `drakegrasp assemble --reject` reads it. The file identifies an attempt by its object, palm pose and
-stand-off, which stay valid while a build runs and after other attempts were added. A text file
-identifies trials by their ids, which are known once the dataset is assembled.
+stand-off, which stay valid while a build runs and after other attempts were added.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from pydantic import BaseModel, ConfigDict, Field, with_config
 
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.errors import DataError, printable
-from drakegrasp.foreign_files import read_text
 from drakegrasp.runtime.files import write_atomic
 
 FILE_NAME = "reject.json"
@@ -27,8 +25,6 @@ FILE_NAME = "reject.json"
 VERSION = 1
 #: Maximum number of rejections without effect that a message names.
 NAMED = 5
-#: Number of digits that the id of a trial stays below.
-_MOST_DIGITS = 19
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -119,32 +115,6 @@ def write_decisions(path: Path, decisions: Decisions) -> None:
         "kept": [stated(key) for key in sorted(decisions.kept)],
     }
     write_atomic(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
-
-
-def read_rejected(path: Path) -> list[int] | list[AttemptKey]:
-    """Return the trials that a file rejects: a `reject.json`, or a text file of trial ids.
-
-    The text file has an id per line; # starts a comment. A file whose name ends in `.json` is read
-    as a `reject.json`.
-
-    Raises:
-        DataError: If the file is neither.
-    """
-    if path.suffix == ".json":
-        return sorted(read_decisions(path).rejected)
-    try:
-        lines = read_text(path).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        got = "a binary file" if isinstance(error, UnicodeDecodeError) else error.strerror
-        raise DataError(f"{path}: must be a text file of trial ids, got {got}") from None
-    ids = []
-    for number, line in enumerate(lines, start=1):
-        text = line.partition("#")[0].strip()
-        if text and not (text.isascii() and text.isdecimal() and len(text) < _MOST_DIGITS):
-            raise DataError(f"{path}, line {number}: must be the id of a trial, got {text[:40]!r}")
-        if text:
-            ids.append(int(text))
-    return ids
 
 
 def find_keys(

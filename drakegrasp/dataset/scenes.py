@@ -22,14 +22,21 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
-from drakegrasp.dataset.hdf5 import AnyArray, ImageRows, read_columns, read_texts
-from drakegrasp.dataset.opening import SCENE_TABLES, open_scenes, opened, refuse_other_codes
+from drakegrasp.dataset.hdf5 import (
+    SCENE_TABLES,
+    AnyArray,
+    ImageRows,
+    open_scenes,
+    opened,
+    read_columns,
+    read_texts,
+    refuse_other_codes,
+)
 from drakegrasp.dataset.reader import GraspDataset, emptiness_of
-from drakegrasp.dataset.remote import local_file
 from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS
 from drakegrasp.dataset.trials import Trials, reopened, stamp
 from drakegrasp.errors import DataError
-from drakegrasp.foreign_files import parse_json
+from drakegrasp.foreign_files import parse_json, refuse_address
 from drakegrasp.frames import X_WT, Frame, invert_pose, pack_pose, unpack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.outcomes import LOST, Outcome
@@ -153,7 +160,8 @@ class SceneDataset:
                 raise DataError(f"{name} must be 1 or more, got {count}")
         if not 0.0 <= on_object <= 1.0:
             raise DataError(f"on_object must be 0 to 1, got {on_object}")
-        self.path = local_file(path)
+        refuse_address(path)
+        self.path = Path(path).absolute()
         self.split, self.frame, self.epoch = split, frame, 0
         self._points, self._grasps, self._seed = points, grasps, seed
         self._on_object, self._noise, self._cache = on_object, noise, cache

@@ -6,9 +6,8 @@ is not listed here is in no file. Imports only NumPy, so that a reader can load 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,8 @@ SCHEMA_VERSION = 5
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
 SPLITS = ("train", "valid", "test")
+#: Letters in the shapes of fields, see `Field`.
+LETTERS = ("k", "j", "S", "h", "w", "o")
 #: Units in which people read numbers, and the factors that convert SI values to them.
 SHOWN_UNITS = {"": 1.0, "s": 1.0, "N": 1.0, "kg": 1.0, "mm": 1e3, "°": float(np.rad2deg(1.0))}
 CAMERAS = ("oto", "otm")
@@ -151,12 +152,13 @@ class Field:
         return tuple(int(axis) if axis.isdecimal() else axis for axis in self.shape.split())
 
     def row_shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
-        """Return the shape of a row, with `sizes` in place of the letters.
+        """Return the shape of a row, with `sizes` in place of the letters; `6k` follows from `k`.
 
         Raises:
             KeyError: If a letter is missing.
         """
-        return tuple(sizes[axis] if isinstance(axis, str) else axis for axis in self.axes)
+        known = {**sizes, "6k": 6 * sizes.get("k", 0)}
+        return tuple(known[axis] if isinstance(axis, str) else axis for axis in self.axes)
 
     def value_of(self, source: object) -> Any:
         """Return the field's value from the source of a row, or None if its stage is missing."""
@@ -195,7 +197,7 @@ def refuse_other_schema(path: Path, version: object) -> None:
 
 def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
     """Return the lengths of the letters in the shapes."""
-    return {"k": fingers, "6k": 6 * fingers, "j": joints, "S": image}
+    return {"k": fingers, "j": joints, "S": image}
 
 
 def with_derived(
@@ -207,12 +209,6 @@ def with_derived(
         if field.derive is not None and all(name in columns for name in field.needs):
             found[field.name] = field.derive(columns).astype(field.dtype)
     return found
-
-
-def sources_of(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns of a shard from which given columns of `/trials` are read or derived."""
-    needs = {field.name: field.needs for field in TRIAL_FIELDS if field.derive is not None}
-    return tuple(dict.fromkeys(chain.from_iterable(needs.get(name, (name,)) for name in names)))
 
 
 def stored_fields(fields: Sequence[Field], *, repeats: bool) -> tuple[Field, ...]:

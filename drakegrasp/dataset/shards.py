@@ -14,27 +14,20 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import AnyArray, read_columns, write_fixed
-from drakegrasp.dataset.opening import (
-    Kind,
-    differences,
-    opened,
-    read_codes,
-    refuse_first,
-    refuse_other_attributes,
-)
+from drakegrasp.dataset.hdf5 import AnyArray, opened, write_fixed
 from drakegrasp.dataset.paths import shards_folder
-from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS, Field
+from drakegrasp.dataset.schema import (
+    LOOK_FIELDS,
+    SCHEMA_VERSION,
+    TRIAL_FIELDS,
+    Field,
+    refuse_other_schema,
+)
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
 #: Fields of `/trials` that are known for the whole dataset only; shards do not have them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
-_ATTRIBUTES: Mapping[str, Kind] = {
-    **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), str),
-    **dict.fromkeys(("start", "stop"), int),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,68 +111,28 @@ def write_shard(out: Path, shard: Shard) -> Path:
     return path
 
 
-def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bool = True) -> Shard:
-    """Return a shard.
+@contextmanager
+def open_shard(path: Path, header: ShardHeader, *, verify_seal: bool = True) -> Iterator[h5py.File]:
+    """Open a shard for reading while the block runs.
 
     Args:
         path: Path of the file.
-        header: Identity that the shard must have; any if None.
-        verify_seal: Whether to hash the whole file and compare the hash with its seal.
+        header: Identity that the shard must have.
+        verify_seal: Whether to verify the seal first, which reads the whole file: an intact shard
+            is as it was written.
 
     Raises:
         DataError: If the file is missing or truncated, if a single bit of it has changed, or if it
             belongs to another schema, configuration, mesh or range; the message names the file and
             the reason.
     """
-    with open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
-        return Shard(
-            header=own_header,
-            trials=read_columns(file["trials"], trial_columns()),
-            looks=read_columns(file["looks"], LOOK_FIELDS),
-        )
-
-
-@contextmanager
-def open_shard(
-    path: Path,
-    header: ShardHeader | None,
-    *,
-    verify_seal: bool = True,
-    again: bool = False,
-) -> Iterator[tuple[h5py.File, ShardHeader]]:
-    """Open a shard for reading, with its header, while the block runs.
-
-    Args:
-        path: Path of the file.
-        header: Identity that the shard must have; any if None.
-        verify_seal: Whether to verify the seal first, which reads the whole file.
-        again: Whether the same work has opened the shard before; then only its identity is checked.
-
-    Raises:
-        DataError: See `read_shard`.
-    """
     if verify_seal:
         refuse_broken_seal(path)
-    with opened(path, "a complete shard", again=again) as file:
-        refuse_other_attributes(path, file, _ATTRIBUTES)
+    with opened(path, "a complete shard", again=not verify_seal) as file:
+        refuse_other_schema(path, file.attrs.get("schema_version"))
 
         # Check the identity: a file may have been copied to the path of another unit.
-        own_header = ShardHeader(
-            config_hash=file.attrs["config_hash"],
-            mesh_sha256=file.attrs["mesh_sha256"],
-            object_name=file.attrs["object_name"],
-            start=int(file.attrs["start"]),
-            stop=int(file.attrs["stop"]),
-        )
-        if header is not None and own_header.stored != header.stored:
-            raise DataError(
-                f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
-            )
-
-        # Check the columns, outcomes and row numbers.
-        if not again:
-            tables = {"trials": trial_columns(), "looks": LOOK_FIELDS}
-            refuse_first(path, differences(file, tables))
-            outcomes = read_codes(file["trials/outcome"], list(Outcome))
-            read_codes(file["looks/row"], len(outcomes))
-        yield file, own_header
+        own = ShardHeader(**{name: file.attrs[name] for name in header.stored})
+        if own.stored != header.stored:
+            raise DataError(f"{path}: must be a shard of {header.label}, got one of {own.label}")
+        yield file

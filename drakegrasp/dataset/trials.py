@@ -13,31 +13,30 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import Any, Literal, overload
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, read_columns, read_names, read_texts
-from drakegrasp.dataset.opening import (
+from drakegrasp.dataset.hdf5 import (
+    AnyArray,
     open_samples,
     open_trials,
     opened,
     read_codes,
+    read_columns,
+    read_texts,
     refuse_other_codes,
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, SPLITS, TRIAL_FIELDS
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT, Frame, invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.table import Table
-
-if TYPE_CHECKING:
-    import pandas
 
 #: Frames in which contacts can be returned.
 FRAMES = (Frame.OBJECT, Frame.TABLE, Frame.PALM, Frame.WORLD)
@@ -63,8 +62,6 @@ class Trials:
 
     Args:
         out: Directory of an assembled dataset, or its trials.hdf5.
-        any_name: Whether objects may have names that are not valid names of files, which is enough
-            for display.
 
     Attributes:
         path: The directory of the dataset, or its trials.hdf5, as an absolute path.
@@ -75,13 +72,11 @@ class Trials:
         DataError: If the file is missing, damaged or differs from the schema.
     """
 
-    def __init__(self, out: str | Path, *, any_name: bool = False) -> None:
+    def __init__(self, out: str | Path) -> None:
         self.path = Path(out).absolute()
         path = self.path if self.path.is_file() else self.path / TRIALS_FILE
         with open_trials(path) as file:
             group = file["objects"]
-            if not any_name:
-                read_names(group["name"])
             self.objects: Mapping[str, AnyArray] = {
                 f.name: np.array(read_texts(group[f.name]), dtype=object)
                 if f.dtype == "str"
@@ -276,49 +271,6 @@ class Trials:
             normals=multiply(normals, R_OF),
             forces=multiply(forces, R_OF),
         )
-
-    def to_pandas(self, names: Sequence[str] | None = None) -> pandas.DataFrame:
-        """Return a pandas data frame with a row per attempt, by trial id.
-
-        Args:
-            names: See `columns`; if None, all columns with one value per attempt. Several values of
-                an attempt become columns `slip`, `closed_q.0`, ...; outcomes and names are
-                categories.
-
-        Raises:
-            DataError: If there is no such column.
-            MachineError: If pandas is not installed.
-        """
-        try:
-            import pandas
-        except ModuleNotFoundError:
-            raise MachineError("to_pandas needs pandas, got none: pip install pandas") from None
-        if names is None:
-            names = [name for name, field in FIELDS.items() if not field.shape] + [*DERIVED]
-
-        # Several values of an attempt become several columns.
-        series: dict[str, Any] = {}
-        for name, values in self.columns(names).items():
-            if values.ndim > 1:
-                flat = values.reshape(len(values), -1)
-                series |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
-            else:
-                series[name] = values
-
-        # Outcomes and splits become texts.
-        if "outcome" in series:
-            labels = {outcome.value: outcome.label for outcome in Outcome}
-            series["outcome"] = [labels[int(value)] for value in series["outcome"]]
-        if "split" in series:
-            series["split"] = [
-                {**dict(enumerate(SPLITS)), NONE: None}[int(value)] for value in series["split"]
-            ]
-        frame = pandas.DataFrame(series, index=pandas.Index(self.trial_ids, name="trial_id"))
-        frame = frame.drop(columns="trial_id", errors="ignore")
-        words = [
-            name for name in ("outcome", "split", "object_name", "class_name") if name in frame
-        ]
-        return frame.astype(dict.fromkeys(words, "category"))
 
     # Files
 

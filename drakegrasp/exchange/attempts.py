@@ -16,11 +16,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp import __version__, registry
 from drakegrasp.dataset.reader import GraspDataset
@@ -28,19 +27,15 @@ from drakegrasp.errors import (
     DrakegraspError,
     GraspError,
     HandError,
-    MachineError,
     listed,
     one_line,
 )
 from drakegrasp.exchange import columns
-from drakegrasp.exchange.columns import ARRAYS, HDF5_SUFFIXES, MOST_BYTES, TABLES, column_names
-from drakegrasp.exchange.contacts import read_contacts
-from drakegrasp.foreign_files import refuse_irregular
+from drakegrasp.exchange.columns import ARRAYS, CONTACTS, HDF5_SUFFIXES, array_names, read_contacts
 from drakegrasp.frames import Array, as_numbers, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.files import is_grasp_file
 from drakegrasp.runtime.files import atomic_path
-from drakegrasp.runtime.plain_pickle import npy_header
 from drakegrasp.simulation.attempts import (
     CONDITIONS,
     UNTOLD,
@@ -78,22 +73,43 @@ _KNOWN = (
 )
 
 
-@overload
-def read_attempts(
-    path: Path, hand: Hand, *, of: None = None, read_as: Mapping[str, str] | None = None
-) -> Attempts: ...
-
-
-@overload
-def read_attempts(
+def read_predictions(
     path: Path,
     hand: Hand,
     *,
-    of: str | GraspDataset | None,
+    of: str | GraspDataset,
     split: str | None = None,
     several: bool = False,
     read_as: Mapping[str, str] | None = None,
-) -> Attempts | ContactRows: ...
+) -> Attempts | ContactRows:
+    """Return the postures or the contacts of a file as a table; contacts do not name their objects.
+
+    Args:
+        path: The file, or a folder of files of postures.
+        hand: The hand.
+        of: See `read_attempts`; contacts are all for this object, or for the rows of this split.
+        split: Name of the group to read in an HDF5 file of contacts; if `of` is a split of a
+            dataset, the group of this split is read.
+        several: Whether the contacts are for rows of a dataset, of which each may have several
+            grasps (n, m, 6k), with a confidence.
+        read_as: See `read_attempts`.
+
+    Raises:
+        GraspError: If the file has no contacts or postures of this hand.
+        DataError: If the dataset cannot be used.
+        MachineError: If a package is missing that the format needs.
+    """
+    if holds_postures(path):
+        return read_attempts(path, hand, of=of, read_as=read_as)
+    data = of if isinstance(of, GraspDataset) else None
+    said = read_contacts(path, split=data.split if data else split, axes=3 if several else 2)
+    with named(path):
+        if several and data is not None:
+            return read_several(**said, fingers=hand.num_fingers, data=data)
+        table = read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
+        if (stated := said["confidence"]) is None:
+            return table
+        return replace(table, confidence=read_confidence(stated, (len(table),)))
 
 
 def read_attempts(
@@ -101,11 +117,9 @@ def read_attempts(
     hand: Hand,
     *,
     of: str | GraspDataset | None = None,
-    split: str | None = None,
-    several: bool = False,
     read_as: Mapping[str, str] | None = None,
-) -> Attempts | ContactRows:
-    """Return the postures or contacts of a file, or the postures of a folder of files, as a table.
+) -> Attempts:
+    """Return the postures of a file, or of a folder of files, as a table.
 
     An invalid row stays in the table, with the reason. An invalid file of a folder is one such row.
 
@@ -117,12 +131,7 @@ def read_attempts(
             a column `row`, or one grasp per row of the split, or exported samples, of which those
             of the split are used, or grasps that only name their object, each of which is used for
             every row of this object. Objects, and the camera for grasps in the frame "camera", are
-            those of the rows, and `Attempts.of_row` has the row numbers. Contacts do not name an
-            object, so `of` must be given for them.
-        split: Name of the group to read in an HDF5 file of contacts; if `of` is a split of a
-            dataset, the group of this split is read.
-        several: Whether the contacts are for rows of a dataset, of which each may have several
-            grasps (n, m, 6k), with a confidence.
+            those of the rows, and `Attempts.of_row` has the row numbers.
         read_as: Values for all postures. `frame` and `link` replace those of the file; `preshape`
             is used for rows that do not name one.
 
@@ -131,19 +140,6 @@ def read_attempts(
         DataError: If the dataset cannot be used.
         MachineError: If a package is missing that the format needs.
     """
-    # Contacts, which do not name their objects.
-    if of is not None and not holds_postures(path):
-        data = of if isinstance(of, GraspDataset) else None
-        said = read_contacts(path, split=data.split if data else split, axes=3 if several else 2)
-        with named(path):
-            if several and data is not None:
-                return read_several(**said, fingers=hand.num_fingers, data=data)
-            table = read_grasps(said["grasps"], hand.num_fingers, rows=said["rows"])
-            if (stated := said["confidence"]) is None:
-                return table
-            return replace(table, confidence=read_confidence(stated, (len(table),)))
-
-    # Postures of a file, or of all files of a folder.
     read_as = read_as or {}
     if isinstance(of, GraspDataset):
         return _for_rows(path, hand, of, read_as)
@@ -210,17 +206,6 @@ def suffixes() -> tuple[str, ...]:
 def read_arrays(path: Path, hand: Hand) -> dict[str, Any]:
     """Return the postures of arrays in our own layout."""
     return _of_arrays(columns.read_arrays(path))
-
-
-def read_palms(path: Path, hand: Hand) -> dict[str, Any] | None:
-    """Return the palm poses of a .npy file of (n, 4, 4) numbers; None for any other .npy file."""
-    poses = _poses_alone(path)
-    return None if poses is None else _of_arrays({"X_FG": poses})
-
-
-def read_columns(path: Path, hand: Hand) -> dict[str, Any]:
-    """Return the postures of a table."""
-    return _of_columns(*columns.read_table(path))
 
 
 def write_attempts(path: Path, table: Attempts, hand: Hand, *, network: str | None = None) -> None:
@@ -407,17 +392,15 @@ def holds_postures(path: Path) -> bool:
     suffix = path.suffix.lower()
     try:
         if suffix == ".npy" and path.is_file():
-            return is_grasp_file(path) or _poses_alone(path) is not None
-        if suffix in (*HDF5_SUFFIXES, *TABLES) and path.is_file():
-            there = set(column_names(path))
+            return is_grasp_file(path)
+        if suffix in HDF5_SUFFIXES and path.is_file():
+            there = set(array_names(path))
             return bool(there & {"q_grasp", "X_FG", "quaternion", "object", "qw"}) or is_graspgen(
                 there
             )
-    except MachineError:
-        raise
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
         raise GraspError(f"{path}: {one_line(error)}") from None
-    return suffix in suffixes() and suffix not in (".npy", *HDF5_SUFFIXES, *TABLES)
+    return suffix in suffixes() and suffix not in CONTACTS
 
 
 def is_graspgen(names: Iterable[str]) -> bool:
@@ -432,8 +415,8 @@ def has_rows(path: Path) -> bool:
         GraspError: If the file cannot be read.
     """
     with named(path):
-        known = path.is_file() and path.suffix.lower() in (*ARRAYS, *TABLES)
-        return known and "row" in column_names(path)
+        known = path.is_file() and path.suffix.lower() in ARRAYS
+        return known and "row" in array_names(path)
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -442,7 +425,7 @@ def files_in(folder: Path) -> list[Path]:
     Raises:
         GraspError: If there are no such files.
     """
-    known = (".npy", *YAMLS, *ARRAYS, *TABLES)
+    known = (".npy", *YAMLS, *ARRAYS)
     others = [(suffix,) for suffix in suffixes() if suffix not in known]
     for group in ((".npy",), YAMLS, *others):
         paths = (path for path in folder.rglob("*") if path.suffix.lower() in group)
@@ -464,20 +447,6 @@ def _sha256(path: Path) -> bytes:
 
 
 # Arrays
-
-
-def _poses_alone(path: Path) -> Array | None:
-    """Return the poses (n, 4, 4) of a .npy file; None if it holds anything else."""
-    try:
-        refuse_irregular(path, MOST_BYTES)
-        with path.open("rb") as file:
-            shape, dtype = npy_header(file)
-            if len(shape) != 3 or shape[1:] != (4, 4) or dtype.kind not in "fiu":
-                return None
-            file.seek(0)
-            return np.lib.format.read_array(file, allow_pickle=False).astype(float)
-    except (OSError, EOFError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError):
-        return None
 
 
 def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
@@ -570,66 +539,3 @@ def _stacked(value: Any, name: str) -> Array:
     if X.ndim != 3 or X.shape[1:] != (4, 4):
         raise GraspError(f"{name} must be of shape (n, 4, 4), got {X.shape}")
     return X
-
-
-# Tables
-
-
-def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> dict[str, Any]:
-    """Return the rows of a table that has one column per number; see `_of_arrays`."""
-    place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
-    if missing := [name for name in place if name not in columns]:
-        raise GraspError(f"columns must include {', '.join(missing)}, got {listed(list(columns))}")
-
-    def numbers(*names: str) -> Array:
-        return np.column_stack([_floats(columns, name, invalid) for name in names])
-
-    # Convert to arrays: the joints of each stage in the order of the grasp, the pose, numbers and
-    # texts.
-    arrays: dict[str, Any] = {}
-    alone = np.ones(len(invalid), dtype=bool)
-    for stage in ("grasp", "pregrasp", "squeeze"):
-        names = [n.removeprefix(f"{stage}_") for n in columns if n.startswith(f"{stage}_")]
-        if names:
-            joints = arrays.setdefault("joints", names)
-            if set(names) != set(joints):
-                raise GraspError(f"{stage}_ columns must be of the joints of grasp_, got others")
-            cells = [f"{stage}_{n}" for n in joints]
-            arrays[f"q_{stage}"] = numbers(*cells)
-            alone &= _empty(columns, cells)
-    arrays["position"], arrays["quaternion"] = np.split(numbers(*place), [3], axis=1)
-    for name in filter(columns.__contains__, (*_SCALARS, *CONDITIONS, "row", "confidence")):
-        arrays[name] = numbers(name)[:, 0]
-    if "row" in arrays and np.array_equal(arrays["row"], np.floor(arrays["row"])):
-        arrays["row"] = arrays["row"].astype(np.int64)
-    for name in filter(columns.__contains__, ("object", "source", "preshape", *_OF_FILE[:2])):
-        # A value for all rows is not taken from an invalid row.
-        texts = zip(columns[name], invalid, strict=True)
-        told = [str(text or "") for text, bad in texts if name not in _OF_FILE or not bad]
-        arrays[name] = np.array(told, dtype=object)
-    raw = _of_arrays(arrays)
-    reasons = [one or other for one, other in zip(invalid, raw["invalid"], strict=True)]
-    # The columns name the parts of quaternions, so their order is certain.
-    return {**raw, "alone": alone, "invalid": reasons, "X_FG_xyzw": None}
-
-
-def _empty(columns: Mapping[str, list[Any]], names: Sequence[str]) -> npt.NDArray[np.bool_]:
-    """Return (n,), whether all cells of each row are empty in the named columns."""
-    rows = zip(*(columns[name] for name in names), strict=True)
-    return np.array([all(cell in (None, "") for cell in row) for row in rows], dtype=bool)
-
-
-def _floats(
-    columns: Mapping[str, list[Any]], name: str, invalid: list[str]
-) -> npt.NDArray[np.float64]:
-    """Return a column as numbers; an empty cell becomes NaN.
-
-    For a cell that is not a number, the reason is added to `invalid`, unless the row has one.
-    """
-    values = np.full(len(columns[name]), np.nan)
-    for i, cell in enumerate(columns[name]):
-        try:
-            values[i] = np.nan if cell in (None, "") else float(cell)
-        except (TypeError, ValueError):
-            invalid[i] = invalid[i] or f"{name} must be a number, got {cell!r}"
-    return values

@@ -1,44 +1,40 @@
-"""Files of columns, as other programs write them: NumPy, HDF5, CSV and Parquet.
+"""Files of arrays, as other programs write them, and the contacts that some of them hold.
 
-Input: a file. Output: its columns as they are stored, or an error in one line. What they mean is a
-matter of `contacts` and `attempts`.
+Input: a NumPy or HDF5 file. Output: its arrays as they are stored, or
+the grasps as k points and k outward normals each, with dataset rows and confidence; or an error in
+one line. The meaning of arrays of postures is a matter of `attempts`.
 """
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import h5py
 import numpy as np
 
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.errors import GraspError, MachineError, first_line, one_line
-from drakegrasp.foreign_files import LARGEST_TEXT, read_npz, refuse_irregular
+from drakegrasp.errors import GraspError, first_line, one_line
+from drakegrasp.foreign_files import read_npz, refuse_irregular
 from drakegrasp.frames import Array, as_numbers
 
-#: Suffixes of HDF5 files, of all files of arrays, and of tables.
+#: Suffixes of HDF5 files, of all files of several arrays, and of files that can hold contacts.
 HDF5_SUFFIXES = (".h5", ".hdf5")
-ARRAYS, TABLES = (".npz", *HDF5_SUFFIXES), (".csv", ".parquet")
-#: Maximum total size of the columns of a file [bytes]: two million postures of a hand with 16
+ARRAYS, CONTACTS = (".npz", *HDF5_SUFFIXES), (".npy", *HDF5_SUFFIXES)
+#: Maximum total size of the arrays of a file [bytes]: two million postures of a hand with 16
 #: joints.
 MOST_BYTES = 1_000_000_000
+#: Advice for a file that holds poses instead of contacts.
+_POSES = ": poses of the palm go with joints into a file of postures, as X_FG, object and q_grasp"
+#: Names of the arrays of contacts in an HDF5 file.
+GRASPS, ROWS, CONFIDENCE = NAMES = ("grasps", "rows", "confidence")
 
 
-def column_names(path: Path) -> list[str]:
-    """Return the names of a file's columns, of an HDF5 file those at its root."""
-    suffix = path.suffix.lower()
-    if suffix in HDF5_SUFFIXES:
+def array_names(path: Path) -> list[str]:
+    """Return the names of the arrays of a file, of an HDF5 file those at its root."""
+    if path.suffix.lower() in HDF5_SUFFIXES:
         with open_hdf5(path) as file:
             return list(file)
-    if suffix == ".parquet":
-        return list(parquet().read_schema(path).names)
-    if suffix == ".csv":
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return next(_cells(file), [])
     return list(read_arrays(path))
 
 
@@ -66,56 +62,6 @@ def refuse_large(size: int) -> None:
         raise GraspError(f"arrays must be at most {MOST_BYTES:.0e} bytes, got {size:.1e}")
 
 
-def read_table(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
-    """Return the columns of a CSV or Parquet file, and for each row why it is invalid, or ""."""
-    if path.suffix.lower() == ".parquet":
-        library = parquet()
-        try:
-            said = library.read_metadata(path)
-            refuse_large(8 * said.num_rows * said.num_columns)
-            table = library.read_table(path)
-            return dict(table.to_pydict()), [""] * table.num_rows
-        except Exception as error:
-            raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
-
-    # CSV: a row with too few or too many cells is invalid by itself.
-    try:
-        refuse_irregular(path, LARGEST_TEXT)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header, *rows = _cells(file)
-    except (OSError, ValueError, csv.Error) as error:
-        raise GraspError(f"must be a table with a header, got: {one_line(error)}") from None
-    if twice := [name for name in header if header.count(name) > 1]:
-        raise GraspError(f"columns must have different names, got {twice[0]} twice")
-    size = len(header)
-    invalid = [
-        "" if len(row) == size else f"the row must have {size} values, got {len(row)}"
-        for row in rows
-    ]
-    cells = [[*row, *[""] * size][:size] for row in rows]
-    return {name: [row[i] for row in cells] for i, name in enumerate(header)}, invalid
-
-
-def parquet() -> Any:
-    """Return the library that reads Parquet."""
-    try:
-        import pyarrow.parquet
-    except ImportError:
-        raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
-    return pyarrow.parquet
-
-
-def _cells(file: TextIO) -> Iterator[list[str]]:
-    """Yield the cells of each line of a CSV file, without the blanks around them.
-
-    Cells are separated by semicolons if the first line has semicolons and no comma, else by commas.
-    """
-    first = file.readline()
-    comma = "," if "," in first or ";" not in first else ";"
-    for row in csv.reader(chain([first], file), delimiter=comma, skipinitialspace=True):
-        yield [cell.strip() for cell in row]
-
-
 def read_numbers(path: Path) -> Array:
     """Return the real numbers of a `.npy` file, of any shape. Pickled objects are not loaded.
 
@@ -135,3 +81,94 @@ def read_numbers(path: Path) -> Array:
             f"{path}: must be a .npy file of numbers, got none ({first_line(error)})"
         ) from None
     return as_numbers(array, f"{path}: must hold real numbers")
+
+
+# Contacts
+
+
+def read_contacts(path: Path, *, split: str | None = None, axes: int = 2) -> dict[str, Any]:
+    """Return the `grasps`, `rows` and `confidence` of a file.
+
+    The grasps are (n, m), or (n, j, m) for j grasps per row, with n at least 1. The rows (n,) are
+    row numbers in a dataset's split. The confidence is returned as stored. Rows or confidence that
+    the file does not have are None.
+
+    Args:
+        path: A `.npy` file, (n, m) or (m,); or an HDF5 file (`.h5`, `.hdf5`) with an array
+            `grasps`, and optionally `rows` and `confidence`, all at the root or all in one group.
+        split: Name of the group to read in an HDF5 file. If it is None or there is no such group,
+            the root is read. If it is None and the root has no grasps, the only group with grasps
+            is read.
+        axes: Maximum number of axes of the array of grasps; 3 allows several grasps per row.
+
+    Raises:
+        GraspError: If the file cannot be read as one of these; the message names the file.
+    """
+    suffix, where = path.suffix.lower(), str(path)
+    if suffix not in CONTACTS:
+        *names, last = CONTACTS
+        raise GraspError(f"{path}: must be a file {', '.join(names)} or {last}, got {suffix!r}")
+    if not path.is_file():
+        raise GraspError(f"{path}: must be a file of grasps, got none")
+    try:
+        if suffix == ".npy":
+            arrays = {GRASPS: read_numbers(path)}
+        else:
+            with open_hdf5(path) as file:
+                group = _choose_group(path, file, split)
+                where = f"{path}: {group.name.rstrip('/')}"
+                arrays = {n: group[n][()] for n in NAMES if isinstance(group.get(n), h5py.Dataset)}
+    except GraspError:
+        raise
+    except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
+        raise GraspError(
+            f"{path}: must be a file of grasps, rows of equally many numbers by the name "
+            f"{GRASPS!r}, got none ({first_line(error)})"
+        ) from None
+
+    # One row per grasp.
+    name = f"{where}/{GRASPS}" if suffix in HDF5_SUFFIXES else where
+    grasps = _grasps(as_numbers(arrays[GRASPS], f"{name}: must hold real numbers"), name, axes)
+    rows = arrays.get(ROWS)
+    if rows is not None:
+        rows = np.asarray(rows)
+        if rows.dtype.kind not in "iu" or rows.shape != (len(grasps),):
+            raise GraspError(
+                f"{where}/{ROWS} must hold one whole number for each of the {len(grasps)} grasps, "
+                f"got {rows.dtype} of shape {rows.shape}"
+            )
+        rows = rows.astype(np.int64)
+    return {GRASPS: grasps, ROWS: rows, CONFIDENCE: arrays.get(CONFIDENCE)}
+
+
+def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
+    """Return the group of an HDF5 file from which to read the grasps; see `read_contacts`."""
+    # Find all groups with grasps; the root has an empty name here.
+    groups = {"": file} | {k: v for k, v in file.items() if isinstance(v, h5py.Group)}
+    groups = {k: v for k, v in groups.items() if isinstance(v.get(GRASPS), h5py.Dataset)}
+    for name in (split, ""):
+        if name in groups:
+            return groups[name]
+    if split is None and len(groups) == 1:
+        return next(iter(groups.values()))
+
+    # No group has grasps, or several have them and none was chosen.
+    must = f"in /{split} or at the root" if split else "at the root or in one group"
+    got = ", ".join(f"/{name}" for name in groups)
+    choose = "; choose with --split" if groups else ""
+    raise GraspError(
+        f"{path}: must hold an array {GRASPS!r} {must}, "
+        f"got {f'them in {got}' if got else 'none'}{choose}"
+    )
+
+
+def _grasps(array: Array, where: str, axes: int) -> Array:
+    """Return an array with one row per grasp; a single grasp (m,) becomes one row."""
+    if array.size == 0:
+        raise GraspError(f"{where}: must hold at least one grasp, got none")
+    if not 1 <= array.ndim <= axes:
+        raise GraspError(
+            f"{where}: must be an array with a row per grasp, or one grasp, "
+            f"got an array of shape {array.shape}{_POSES if array.shape[-2:] == (4, 4) else ''}"
+        )
+    return np.atleast_2d(array)

@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from drakegrasp import registry
-from drakegrasp.dataset.opening import refuse_other_codes
-from drakegrasp.dataset.paths import DATA_FILES, model_path
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, model_path
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
-from drakegrasp.dataset.trials import Trials, sample_ids
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, DrakegraspError, one_line
 from drakegrasp.foreign_files import refuse_address
 from drakegrasp.frames import Array, unpack_pose
@@ -151,26 +150,22 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
         DataError: If a file of the dataset is missing or belongs to another dataset, or a sample
             has a number that is not finite.
     """
-    # Find the trials that are samples, and their splits.
-    trials = Trials(out)
-    ids = sample_ids(out)
-    split_of = {row: split for split, rows in ids.items() for row in rows.tolist()}
-    rows = np.array(sorted(split_of), dtype=np.int64)
-    refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials))
-
-    # Read their postures.
-    names = ("object_name", "X_TO", "X_OG", "closed_q", "spread", "unused", "preshape")
-    samples = trials[rows].columns((*names, *CONDITIONS))
+    kept = Trials(out).where(sample=True)
+    names = ("object_name", "split", "X_TO", "X_OG", "closed_q", "spread", "unused", "preshape")
+    samples, rows = kept.columns((*names, *CONDITIONS)), kept.trial_ids
+    if not np.isin(samples["split"], range(len(SPLITS))).all():
+        raise DataError(f"{out}: data files must hold the samples of {TRIALS_FILE}, got others")
     for name in ("X_TO", "X_OG", "closed_q", "spread"):
         for row, values in zip(rows.tolist(), samples[name], strict=True):
             if not np.isfinite(values).all():
                 raise DataError(f"{out}: {name} of trial {row} must be finite numbers, got others")
+
     conditions = np.column_stack([samples[name] for name in CONDITIONS])
     X_TO, X_OG = (unpack_pose(samples[name]) for name in ("X_TO", "X_OG"))
     for i, row in enumerate(rows.tolist()):
         yield ClosedGrasp(
             trial_id=row,
-            split=split_of[row],
+            split=SPLITS[samples["split"][i]],
             object_name=samples["object_name"][i],
             X_TO=X_TO[i],
             X_TG=X_TO[i] @ X_OG[i],

@@ -1,7 +1,7 @@
 """A folder for the Hugging Face Hub, which `datasets.load_dataset(folder, "oto")` reads.
 
 Input: a dataset. Output: Parquet files `<configuration>/<split>-00000-of-00001.parquet`, written by
-`datasets`, and `README.md`, whose head lists them and whose text is the data card of the dataset.
+`datasets`, and `README.md`, the dataset card, whose head lists them.
 Each camera is a configuration. If the dataset has a scenes.hdf5, there is also a configuration of
 views and one of the grasps in the scenes, in which columns that refer to rows of /scenes and
 /objects are replaced by the content of these rows. A scene has the same number in both.
@@ -16,7 +16,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,13 @@ import numpy.typing as npt
 import yaml
 from PIL import Image
 
-from drakegrasp.dataset.card import card_content, card_text
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
 from drakegrasp.dataset.schema import (
     CAMERAS,
+    CONVENTIONS,
     DATA_FIELDS,
     DEPTH_UNIT,
     SCENE_FIELDS,
@@ -40,8 +40,9 @@ from drakegrasp.dataset.schema import (
     VIEW_FIELDS,
     Field,
 )
+from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import MachineError, counted
 from drakegrasp.runtime.progress import Report
 
 #: Description of the format in `drakegrasp export --help`.
@@ -71,8 +72,19 @@ VIEW_COLUMNS, GRASP_COLUMNS = (
 _TEXT = """Samples of a dataset of [drakegrasp](https://pypi.org/project/drakegrasp), one
 configuration for each camera{scenes}. `depth` is in units of {unit:g} m; where nothing is before
 {far:g} m, it is {far:g} m. The cameras' matrix K is {K} [px]. `mask` is 255 where the object is
-seen. A grasp is contact points [m] and normals of the fingers in the camera's frame. What follows
-is the data card of the whole dataset."""
+seen. A grasp is contact points [m] and normals of the fingers {fingers} in the camera's frame.
+
+{conventions}
+
+| split | samples | distinct | objects | classes |
+|---|--:|--:|--:|--:|
+{splits}
+
+Made by {versions} with the hand `{hand}`, configuration `{config}`; split by {by}. Everything is
+simulated: no grasp was tried on a real robot. Licences of the meshes:
+
+{licences}
+"""
 _SCENES = """, `views` of scenes by cameras that know no grasp, and the hands that closed there,
 `scene_grasps`; the column `scene` joins both"""
 
@@ -87,7 +99,7 @@ class HubTable:
         columns: Fields of the columns that are no images.
         has_images: Whether there are the columns `IMAGES`.
         read: Function that takes a start and an end (excluded) and returns the columns of these
-            rows as lists; an image is a cell of `png_cell`.
+            rows; an image is a cell of `png_cell`.
     """
 
     config: str
@@ -95,7 +107,7 @@ class HubTable:
     count: int
     columns: Columns
     has_images: bool
-    read: Callable[[int, int], dict[str, list[Any]]]
+    read: Callable[[int, int], dict[str, Any]]
 
     def write(self, folder: Path, wrote: Callable[[int], None]) -> None:
         """Write the files of the table into the folder of its configuration.
@@ -166,44 +178,66 @@ def write_hub(out: Path, folder: Path, progress: Report, *, licence: str | None 
 
 
 def _card(out: Path, tables: Sequence[HubTable], licence: str | None) -> str:
-    """Return the text of the card: the files of each configuration, and the dataset's own card."""
+    """Return the text of the card: the files of each configuration, and what the rows are."""
     files: dict[str, list[dict[str, str]]] = {}
     for table in tables:
         path = f"{table.config}/{table.split}-*.parquet"
         files.setdefault(table.config, []).append({"split": table.split, "path": path})
-    card = card_content(out)
+
+    # The licences of the meshes, and the samples by split.
+    manifest, objects = read_manifest(out), dict[str, list[str]]()
+    for entry in manifest.objects:
+        objects.setdefault(entry.licence or "not stated", []).append(entry.name)
+    splits = (astuple(count) for count in count_splits(out))
+
     head = {
         "license": licence or "unknown",
-        "pretty_name": card["title"],
+        "pretty_name": f"Simulated grasps of {counted(len(manifest.objects), 'object')}",
         "task_categories": ["robotics"],
         "tags": ["robotics", "grasping", "simulation"],
         "configs": [{"config_name": name, "data_files": each} for name, each in files.items()],
     }
-    # The files that the card lists are those of the dataset.
-    text = card_text({key: value for key, value in card.items() if key != "files"})
-    said = _TEXT.format(
+    text = _TEXT.format(
         scenes=_SCENES if "views" in files else "",
         unit=DEPTH_UNIT,
-        far=read_manifest(out).config.camera.far,
+        far=manifest.config.camera.far,
         K=GraspDataset(out / DATA_FILES["oto"], fewer_fingers=True).K.tolist(),
+        fingers=", ".join(manifest.fingers),
+        conventions="\n".join(f"* **{name}**: {said}" for name, said in CONVENTIONS.items()),
+        splits="\n".join(f"| {' | '.join(map(str, row))} |" for row in splits),
+        versions=", ".join(f"{name} {version}" for name, version in manifest.versions.items()),
+        hand=Path(manifest.config.hand).stem,
+        config=manifest.config.simulation_hash(),
+        by=manifest.config.split.by,
+        licences="\n".join(f"* {licence}: {', '.join(own)}" for licence, own in objects.items()),
     )
-    return f"---\n{yaml.safe_dump(head, sort_keys=False)}---\n\n{said}\n\n{text}"
+    head_text = yaml.safe_dump(head, sort_keys=False)
+    return f"---\n{head_text}---\n\n# {head['pretty_name']}\n\n{text}"
 
 
 def _sample_table(out: Path, camera: str, split: str) -> HubTable:
     """Return the table of a split's samples with the images of a camera."""
     data = GraspDataset(out / DATA_FILES[camera], split=split, fewer_fingers=True)
 
-    def read(start: int, stop: int) -> dict[str, list[Any]]:
+    def read(start: int, stop: int) -> dict[str, Any]:
         samples = (data[row] for row in range(start, stop))
         images = [encode_images(sample.image, sample.mask) for sample in samples]
         return by_name(images) | {
-            name: data.rows(field.name, start, stop).tolist() for name, field in COLUMNS.items()
+            name: _cells(data.rows(field.name, start, stop)) for name, field in COLUMNS.items()
         }
 
     return HubTable(
         config=camera, split=split, count=len(data), columns=COLUMNS, has_images=True, read=read
     )
+
+
+def _cells(values: npt.NDArray[Any]) -> Any:
+    """Return a column in a form that `datasets` takes; as a list it rejects seeds of 64 bits."""
+    if values.dtype != np.uint64:
+        return values.tolist()
+    import pyarrow
+
+    return pyarrow.array(values)
 
 
 def by_name(images: Sequence[Iterable[Any]]) -> dict[str, list[Any]]:
@@ -249,16 +283,16 @@ def _scene_table(
     own, scenes = data.tables[group], data.tables["scenes"]
     rows = np.flatnonzero(scenes["split"][own["scene"]] == SPLITS.index(split))
 
-    def read(start: int, stop: int) -> dict[str, list[Any]]:
+    def read(start: int, stop: int) -> dict[str, Any]:
         at = rows[start:stop]
         scene = own["scene"][at]
         objects = scenes["object"][scene]
-        found: dict[str, list[Any]] = {
+        found: dict[str, Any] = {
             "object_name": np.array(data.names, dtype=object)[objects].tolist(),
             "class_name": np.array(data.classes, dtype=object)[objects].tolist(),
         }
         for name in columns.keys() - found.keys():
-            found[name] = (own[name][at] if name in own else scenes[name][scene]).tolist()
+            found[name] = _cells(own[name][at] if name in own else scenes[name][scene])
         if group == "views":
             found |= by_name([map(png_cell, data.stored_images(row)) for row in at.tolist()])
         return found

@@ -18,12 +18,12 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.successes import successes_of
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.schema import CAMERAS, NO_PRESHAPE, sizes
 from drakegrasp.dataset.shards import ShardHeader, trial_columns
+from drakegrasp.dataset.successes import successes_of
 from drakegrasp.errors import DataError
-from drakegrasp.filters import RULES, Removal, first_removal
+from drakegrasp.filters import RULES, Removal
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import load_hand
@@ -309,8 +309,7 @@ def judge_sample(
         X_TG = multiply(trial.X_TO, trial.X_OG)
         for name, pose in _CAMERA_POSES.items():
             columns[f"X_TC_{name}"] = pack_pose(pose(X_TG, config.camera))[None]
-    successes = successes_of(Table(columns), config.camera)
-    return Removal(int(first_removal(successes, config.filters)[0]))
+    return Removal(int(successes_of(Table(columns), config)["by_rule"][0]))
 
 
 #: Columns of the filters that need the images of a success.

@@ -15,7 +15,6 @@ from pathlib import Path, PurePath
 
 from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
-from drakegrasp.dataset.assembly.removal import own_filters
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -28,6 +27,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.paths import object_files
 from drakegrasp.dataset.statistics import is_assembled
+from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import DataError
 from drakegrasp.hand.folder import carry_hand
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync

@@ -19,9 +19,6 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
-from drakegrasp.dataset.assembly.removal import judge_successes
-from drakegrasp.dataset.assembly.survey import Survey, headers_by_object, known_homes, survey
-from drakegrasp.dataset.card import write_card
 from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
@@ -32,6 +29,7 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.prepared_objects import load_prepared, with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled, palms_in_files
+from drakegrasp.dataset.survey import Decisions, decide, headers_by_object, known_homes, survey
 from drakegrasp.errors import (
     DataError,
     DrakegraspError,
@@ -234,11 +232,11 @@ class _Build:
         self._postures = postures
 
         # With a target: the palm poses that the dataset had of each object, the grasps that are no
-        # samples by inspection, the successes of each completed unit, and the last survey of them.
+        # samples by inspection, the successes of each completed unit, and what is decided of them.
         self._floors: dict[str, int] = {}
         self._rejected = set[tuple[str, int, int]]()
         self._successes: dict[ShardHeader, Table] = {}
-        self._surveyed: Survey | None = None
+        self._decisions: Decisions | None = None
 
     def run(self, sources: Sequence[MeshSource]) -> BuildReport:
         """Prepare, simulate, assemble."""
@@ -430,10 +428,10 @@ class _Build:
             return {}
         if not manifest.units:
             return {}
-        self._surveyed = survey(self._out, manifest, self._successes)
-        successes = self._surveyed.successes
-        lost = judge_successes(successes, filters) == Removal.OUTLIER
-        counts = np.bincount(successes["object"][lost], minlength=len(names))
+        self._decisions = decide(manifest, survey(self._out, manifest, self._successes))
+        objects = self._decisions.survey.successes["object"]
+        lost = objects[self._decisions.removal == Removal.OUTLIER]
+        counts = np.bincount(lost, minlength=len(names))
         return dict(zip(names, counts.tolist(), strict=True))
 
     def _run_units(
@@ -476,12 +474,10 @@ class _Build:
         stale = not is_assembled(out, verify_shards=True)
         if stale:
             with self._progress("assemble", "shards") as report:
-                surveyed = self._surveyed
-                if surveyed is None and self._successes:
-                    surveyed = survey(out, self._manifest, self._successes, progress=report)
-                assemble_locked(out, self._manifest, surveyed=surveyed, progress=report)
-        else:
-            write_card(out)  # the licence of a mesh may have changed
+                known, decisions = self._successes or None, self._decisions
+                assemble_locked(
+                    out, self._manifest, known=known, decisions=decisions, progress=report
+                )
         return stale
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drakegrasp.config import MOST_PALMS, Config
-from drakegrasp.dataset.assembly.removal import own_filters
+from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import ConfigError, MeshError, listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.attempts import Attempts

@@ -19,13 +19,16 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config
-from drakegrasp.dataset.assembly.split import home_by_rank, may_train, rank_in_split
-from drakegrasp.dataset.assembly.survey import known_homes
-from drakegrasp.dataset.card import write_card
-from drakegrasp.dataset.hdf5 import AnyArray, create_field, packed_chunk, write_field
+from drakegrasp.dataset.hdf5 import (
+    SCENE_TABLES,
+    AnyArray,
+    create_field,
+    open_samples,
+    packed_chunk,
+    write_field,
+)
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
-from drakegrasp.dataset.opening import SCENE_TABLES, open_samples
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, count_scenes, grasps_of_trials
@@ -39,6 +42,8 @@ from drakegrasp.dataset.schema import (
     VIEW_KINDS,
     stored_fields,
 )
+from drakegrasp.dataset.split import home_by_rank, may_train, rank_in_split
+from drakegrasp.dataset.survey import known_homes
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
@@ -96,9 +101,7 @@ def make_scenes(
     """
     read_manifest(out)  # fails for a missing directory, which the lock would create
     with build_lock(out):
-        counts = _make_scenes(out, overrides, execute, progress)
-        write_card(out)
-        return counts
+        return _make_scenes(out, overrides, execute, progress)
 
 
 def _make_scenes(

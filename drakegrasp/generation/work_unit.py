@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
-from drakegrasp.dataset.assembly.removal import find_hits, successes_by_rule
-from drakegrasp.dataset.assembly.survey import headers_by_object, shard_successes
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import object_files, shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, ROBUST_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, write_shard
+from drakegrasp.dataset.successes import find_hits, successes_of
+from drakegrasp.dataset.survey import headers_by_object, shard_successes
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import (
@@ -107,7 +107,7 @@ class UnitSummary:
         header: Header of the unit.
         outcomes: Number of attempts by outcome.
         errors: Number of solver errors by message.
-        successes: The successes with what filters need of each, see `successes_by_rule`; None
+        successes: The successes with what filters need of each, see `successes_of`; None
             without a target.
         hits: Candidates and stand-offs of the attempts that count for the target, see `find_hits`;
             empty without a target.
@@ -315,7 +315,7 @@ def _find_unit(out: Path, header: ShardHeader, config: Config) -> UnitSummary | 
     path = header.path(out)
     if not path.exists():
         return None
-    with open_shard(path, header) as (file, _):
+    with open_shard(path, header) as file:
         outcomes = count_outcomes(file["trials/outcome"][:])
         judged = _judged(shard_successes(file), config) if config.has_target else {}
     return UnitSummary(header=header, outcomes=outcomes, errors={}, **judged)
@@ -330,7 +330,7 @@ def _judged(rows: Table, config: Config) -> dict[str, Any]:
     """
     if not config.has_target:
         return {}
-    successes = successes_by_rule(rows, config)
+    successes = successes_of(rows, config)
     return {"successes": successes, "hits": find_hits(successes, config)}
 
 

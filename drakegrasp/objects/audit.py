@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from drakegrasp.config import ways_to_grasps
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
@@ -50,6 +49,11 @@ DENSITIES = (20.0, 8000.0)
 #: Radii of gyration of real objects, as fractions of that of their hull; sheets and shells have
 #: larger ones.
 GYRATION = (0.5, 2.0)
+#: What may help with an object without grasps, with the most helpful measure first.
+WAYS_TO_GRASPS = (
+    "palm poses that face the surface (--set candidates.method=normals), or more resting poses "
+    "(--set objects.resting_poses=4), or another hand (--set hand=NAME)"
+)
 #: Number of faces up to which self-intersections are searched; more would take minutes.
 MOST_CROSSED = 60_000
 #: Number of points among which two opposed sides are searched, and the factor by which the distance
@@ -310,5 +314,5 @@ def _warnings(row: AuditRow, opening: float, height: float, width: float) -> Ite
     if row.extents is not None and row.extents[2] < least and min(row.extents[:2]) < width:
         yield (
             f"its height must be {least * 1e3:.0f} mm for a hand that faces the table, got "
-            f"{row.extents[2] * 1e3:.0f} mm: {ways_to_grasps()}"
+            f"{row.extents[2] * 1e3:.0f} mm: {WAYS_TO_GRASPS}"
         )

@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.assembly.removal import own_setting
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.quality import PARTS
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
+from drakegrasp.dataset.successes import own_setting
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome

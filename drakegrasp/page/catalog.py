@@ -138,7 +138,7 @@ def read_snapshot(out: Path) -> Snapshot:
             f"{out}: must be a finished dataset, got one without {TRIALS_FILE}; finish it first, "
             "with the same command that began to build it"
         )
-    trials = Trials(out, any_name=True)
+    trials = Trials(out)
     try:
         config = parse_stored(parse_json(trials.attributes["config"]))
     except ValueError as error:

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from drakegrasp.arithmetic import multiply, norm
-from drakegrasp.dataset.opening import differences, opened, read_codes, refuse_first
+from drakegrasp.dataset.hdf5 import differences, opened, read_codes, refuse_first
 from drakegrasp.dataset.reader import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import (
     CAMERAS,

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.opening import refuse_other_codes
+from drakegrasp.dataset.hdf5 import refuse_other_codes
 from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
 from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS
 from drakegrasp.errors import DataError

@@ -22,7 +22,7 @@ from matplotlib.image import imsave
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from drakegrasp.dataset.opening import open_samples
+from drakegrasp.dataset.hdf5 import open_samples
 from drakegrasp.dataset.reader import Sample
 from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp

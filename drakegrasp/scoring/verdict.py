@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.attempts import digest_of, named, read_attempts
+from drakegrasp.exchange.attempts import digest_of, named, read_predictions
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array, as_numbers
 from drakegrasp.hand.description import load_hand
@@ -80,7 +80,7 @@ def rank_file(
         ConfigError, HandError, DataError, MachineError: If dataset or hand cannot be used.
     """
     hand = load_hand(dataset_config(data).hand_source)
-    table = read_attempts(path, hand, of=data, several=True, read_as=read_as)
+    table = read_predictions(path, hand, of=data, several=True, read_as=read_as)
     with named(path):
         if isinstance(table, Attempts) and EACH in table.preshape:
             raise GraspError(

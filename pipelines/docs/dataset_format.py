@@ -50,13 +50,9 @@ OUT/
   grasping_oto.hdf5        samples; the camera is rolled with the palm
   grasping_otm.hdf5        the same samples; up in the image is up in the world
   scenes.hdf5              views that do not depend on a grasp, and all closed hands; on request
-  DATACARD.md, .json       content, settings, counts, licences and known limits of the dataset
   reject.json              grasps that an inspection rejects; only if there are any
   build.lock               process that builds; only while a build runs
 ```
-
-The data card is written with the three files, and `drakegrasp check` compares its counts with them.
-It contains neither times nor names of machines, so equal files have equal cards.
 
 A changed bit is detected when a file is read: `sha256` in the manifest is the hash of its other
 keys, shards and plans have a seal, and the HDF5 files store checksums of their columns and of the

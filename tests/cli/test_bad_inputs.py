@@ -22,7 +22,7 @@ from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
 from helpers.bad_inputs.kinds import Kind, Workplace
 from helpers.commands import Result
 from helpers.commands import run as run_command
-from helpers.datasets import OTM, OTO, REPEATED, TRIALS, make_dataset
+from helpers.datasets import OTO, REPEATED, TRIALS, make_dataset
 from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
@@ -46,7 +46,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "stats": ("stats", "{out}"),
     "assemble": ("assemble", "{out}"),
     "check": ("check", "{out}", "--workers", "1"),
-    "check FILE": ("check", "{out}/{file}", "--workers", "1"),
     "replay": ("replay", "{out}", "--trial", "0"),
     "figures": ("figures", "{out}", "--out", "{to}/figures", "--quiet"),
     "inspect": ("inspect", "{out}", "--port", "0", "--no-browser"),
@@ -200,7 +199,7 @@ def test_every_kind_has_a_name() -> None:
     }
     for name, names in tables.items():
         assert len(set(names)) == len(names), name
-    assert sum(map(len, tables.values())) > 1500
+    assert sum(map(len, tables.values())) > 1000
 
 
 #: By file: how it can be spoiled, and the commands that read it.
@@ -215,19 +214,19 @@ FILES: dict[str, tuple[Sequence[Kind], tuple[str, ...]]] = {
     TRIALS: (
         hdf5_kinds.TRIALS,
         (
-            *("stats", "check", "check FILE", "replay", "figures", "inspect", "export glb"),
+            *("stats", "check", "replay", "figures", "inspect", "export glb"),
             "export dexgraspbench",
         ),
     ),
     OTO: (
         hdf5_kinds.DATA,
         (
-            *("stats", "check", "check FILE", "inspect", "export glb", "export dexgraspbench"),
+            *("stats", "check", "inspect", "export glb", "export dexgraspbench"),
             *("export original", "export hf", "verify"),
         ),
     ),
-    SHARD: (hdf5_kinds.SHARD, ("assemble", "check")),
-    PLAN: (hdf5_kinds.PLAN, ("replay", "check")),
+    SHARD: (hdf5_kinds.SEALED, ("assemble", "check")),
+    PLAN: (hdf5_kinds.SEALED, ("replay", "check")),
     MODEL: (array_kinds.MODEL, ("replay", "assemble", "check")),
 }
 
@@ -254,10 +253,6 @@ def test_files(base: Path, tmp_path: Path, file: str, command: str) -> None:
 @every_command
 def test_every_kind_with_every_command(base: Path, tmp_path: Path, file: str, command: str) -> None:
     walk(base, tmp_path, file, FILES[file][0], command)
-
-
-def test_manifest_of_unfinished(base: Path, tmp_path: Path) -> None:
-    walk(base, tmp_path, MANIFEST, manifests.MANIFEST[::20], "inspect", OTO, OTM, TRIALS)
 
 
 @pytest.mark.parametrize("command", [*map(in_second_tier, ("check", "inspect")), "stats"])
@@ -316,7 +311,6 @@ def _npy(path: Path, array: np.ndarray) -> bytes:
 #: Predictions by suffix: how they can be spoiled, and what they are verified against.
 PREDICTIONS = {
     ".npy": (array_kinds.PREDICTIONS_NPY, "--object {mesh}"),
-    ".csv": (array_kinds.PREDICTIONS_CSV, "--object {mesh}"),
     ".h5": (array_kinds.PREDICTIONS_HDF5, "--dataset {data}"),
 }
 
@@ -326,9 +320,7 @@ def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
     import h5py
 
     sound = _npy(tmp_path, array_kinds.GRASP)
-    if suffix == ".csv":
-        sound = array_kinds.LINE.encode()
-    elif suffix == ".h5":
+    if suffix == ".h5":
         with h5py.File(tmp_path / "sound.h5", "w") as file:
             file["grasps"] = np.tile(array_kinds.GRASP, (2, 1))
             file["rows"] = np.arange(2)
@@ -352,8 +344,6 @@ def test_decisions(base: Path, tmp_path: Path) -> None:
     before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file}"
     sound = (base / REJECT).read_bytes()
     walk_file(base, tmp_path, sound, ".json", manifests.DECISIONS, command)
-    kinds = manifests.REJECTED_IDS
-    walk_file(base, tmp_path, b"0\n", ".txt", kinds, command, "rejected trials")
     assert (out / MANIFEST).read_bytes() == before
 
 

@@ -25,7 +25,6 @@ from helpers.tiers import in_second_tier
 
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import MachineError
 from drakegrasp.generation.pipeline import Counts
@@ -36,8 +35,8 @@ from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.trial import TrialRecord
 
 FILES = (OTO, OTM, TRIALS)
-#: Assembling gives the files their names, then the card, and last the manifest.
-LAST = len(FILES) + len(CARD_FILES)
+#: Assembling gives the files their names, and last the manifest.
+LAST = len(FILES)
 #: A filter that would remove every sample.
 SLIPPED = ("--set", f"filters.max_slip={SLIP / 2}")
 
@@ -200,7 +199,7 @@ def test_files_are_of_one_state_or_told_whenever_assembling_is_killed(
     assert run("assemble", out).exit_code == 0
     assert samples(out) == [3] * 4
     assert run("check", out).exit_code == 0
-    whole = ["manifest.json", "objects", "shards", *FILES, *CARD_FILES]
+    whole = ["manifest.json", "objects", "shards", *FILES]
     assert sorted(os.listdir(out)) == sorted(whole)
 
 

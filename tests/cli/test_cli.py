@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -26,7 +27,7 @@ from drakegrasp.cli import main as cli
 from drakegrasp.cli.arguments import What
 from drakegrasp.cli.console import say
 from drakegrasp.cli.main import COMMANDS
-from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
@@ -361,7 +362,6 @@ def test_stats_and_check_print_one_document_of_json(tmp_path: Path) -> None:
     out = make_dataset(tmp_path / "out", tmp_path)
     result = run("stats", out, "--json")
     (stats,) = map(json.loads, result.stdout.splitlines())
-    assert stats["unfinished"] is None
     assert [split["split"] for split in stats["splits"]] == list(SPLITS)
     successes = sum(each["outcomes"].get("success", 0) for each in stats["objects"])
     assert successes == sum(sum(each["removals"].values()) for each in stats["objects"]) > 0
@@ -375,40 +375,16 @@ def test_stats_and_check_print_one_document_of_json(tmp_path: Path) -> None:
     assert "grasping_oto.hdf5" in {broken["file"] for broken in checked["broken"]}
 
 
-@pytest.mark.sim
-@pytest.mark.slow
-def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    shutil.copytree(small_dataset, out)
-    for path in [*out.glob("*.hdf5"), *sorted(out.glob("shards/*/*.h5"))[:2]]:
-        path.unlink()
-    # What is on its way is not there yet.
-    (out / "shards" / "10_box_tall" / ".0000000-0000004.h5.h~1~0123456789ab.tmp").touch()
+def test_stats_of_files_of_another_state_are_one_line(out: Path) -> None:
+    assert (
+        "split by object: 3 objects with samples, 1 of them test, 1 valid\n"
+        in run("stats", out).stdout
+    )
+    manifest = read_manifest(out)
+    write_manifest(replace(manifest, versions={**manifest.versions, "drake": "other"}), out)
     result = run("stats", out)
-    assert result.exit_code == 0, result.output
-    assert f"{out}: not finished: 10 of 12 work units are done" in result.stdout
-    lines = [line.split() for line in result.stdout.splitlines()]
-    funnel, hold = (line for line in lines if line[:1] == ["all"])
-    assert funnel[1:3] == ["48", "120"]
-    assert hold[1] == "120"
-    shutil.rmtree(out / "shards")
-    assert "not finished: 0 of 12 work units are done" in run("stats", out).stdout
-
-
-def test_stats_say_that_nothing_trains(out: Path) -> None:
-    said = run("stats", out).stdout
-    assert "split train is empty" not in said
-    assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
-    assemble(out, overrides=["split.by=class", "split.train_classes=[]"])
-    said = run("stats", out).stdout
-    assert "split train is empty" in said
-    assert "split by class: 3 objects with samples, 3 of them test\n" in said
-    # Of the frozen benchmark it is meant.
-    (out / "builtin").mkdir()
-    (out / "builtin" / "benchmark.json").write_text("{}")
-    assert "split train is empty" not in run("stats", out).stdout
-    said = run("assemble", out, "--set", "split={by: object}").stdout
-    assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
+    assert result.exit_code != 0
+    assert "files must be those of manifest.json, got others" in result.stderr
 
 
 def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 from helpers.commands import Result, error_line, run
 from helpers.datasets import OTM, OTO, make_dataset
@@ -68,9 +69,9 @@ def test_size_of_images_is_that_of_a_dataset(
 
 
 def test_dry_run_of_postures_counts_those_that_can_be_tried(tmp_path: Path) -> None:
-    file, out = tmp_path / "palms.csv", tmp_path / "out"
-    rows = [f"{name},0,0,0.2,1,0,0,0" for name in ("1_mug_1", "1_mug_2", "1_mug_1", "9_jar")]
-    file.write_text("\n".join(["object,x,y,z,qw,qx,qy,qz", *rows]))
+    file, out = tmp_path / "palms.npz", tmp_path / "out"
+    names = ["1_mug_1", "1_mug_2", "1_mug_1", "9_jar"]
+    np.savez(file, object=names, position=[[0, 0, 0.2]] * 4, quaternion=[[1, 0, 0, 0]] * 4)
     assert dry_run(out, "--postures", file).stdout == "2 objects: 3 postures\n"
     assert dry_run(out, "--postures", file, "--only", "1_mug_1").stdout == "1 object: 2 postures\n"
     assert not out.exists()

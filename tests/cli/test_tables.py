@@ -13,10 +13,9 @@ from drakegrasp.cli.tables import (
     audit_table,
     funnel_table,
     hold_table,
-    preshape_table,
     print_table,
 )
-from drakegrasp.dataset.statistics import NO_NAME, Funnel, PreshapeCount
+from drakegrasp.dataset.statistics import Funnel
 from drakegrasp.filters import Removal
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.outcomes import Outcome
@@ -31,7 +30,6 @@ def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funn
         "removals": np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
         "elevations": np.zeros((len(names), 3), dtype=np.int64),
         "approach_cells": none,
-        "preshapes": np.zeros((256, 4), dtype=np.int64),
     }
     return Funnel(
         names=names,
@@ -98,15 +96,6 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
     # Without one there is no column of lifts that were ended.
     outcomes[0, Outcome.MOVED] = 0
     assert "moved" not in printed(funnel_table(funnel, compact=compact))
-
-
-def test_preshape_table_has_a_row_of_each_and_says_which_is_of_none() -> None:
-    counts = [PreshapeCount("[red]", 1200, 7, 5, 4), PreshapeCount(NO_NAME, 3, 1, 0, 0)]
-    text = printed(preshape_table(counts))
-    assert ["[red]", "1,200", "7", "5", "4"] in cells(text)
-    assert [NO_NAME, "3", "1", "0", "0"] in cells(text)
-    assert "all fingers close" in text
-    assert "all fingers close" not in printed(preshape_table(counts[:1]))
 
 
 def test_audit_is_in_millimetres_and_megabytes() -> None:

@@ -14,15 +14,14 @@ import numpy as np
 import pytest
 from helpers.assertions import arrays_of
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
+from helpers.shards import read_shard
 
 from drakegrasp.dataset import assemble as module
-from drakegrasp.dataset import hdf5, shards
-from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
-from drakegrasp.dataset.assembly import survey
-from drakegrasp.dataset.assembly.successes import in_image
-from drakegrasp.dataset.lock import LOCK_FILE, build_lock
+from drakegrasp.dataset import hdf5, shards, survey
+from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest, with_postprocessing
 from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.dataset.successes import in_image
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import (
@@ -77,12 +76,6 @@ def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:
     assert assemble(out).removed == {Removal.KEPT: 9}
 
 
-def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
-    with build_lock(out):
-        assert assemble_locked(out, read_manifest(out)) == summarise(out)
-        assert (out / LOCK_FILE).exists()
-
-
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_palm_and_contacts_of_a_sample_are_as_far_apart_as_in_its_trial(
     out: Path, camera: str
@@ -109,7 +102,7 @@ def spoil(out: Path, edits: Sequence[Spoil]) -> None:
     """Change the first successes, one by each edit, given their rows of /trials and of /looks."""
     left = list(edits)
     for header in read_manifest(out).headers():
-        shard = shards.read_shard(header.path(out), header)
+        shard = read_shard(header.path(out), header)
         for k, row in enumerate(shard.looks["row"].tolist()):
             if left:
                 trial = {name: values[row : row + 1] for name, values in shard.trials.items()}
@@ -186,11 +179,10 @@ def test_a_success_that_is_spoiled_is_removed_for_that_reason(out: Path, first: 
 @pytest.fixture
 def removed(sound: Path) -> Callable[..., Counter[Removal]]:
     """Returns how many successes assembling with other filters removes, by the reason."""
-    manifest = read_manifest(sound)
-    surveyed = survey.survey(sound, manifest)
 
     def count(*overrides: str) -> Counter[Removal]:
-        decisions = survey.decide(with_postprocessing(manifest, overrides), surveyed)
+        manifest = with_postprocessing(read_manifest(sound), overrides)
+        decisions = survey.decide(manifest, survey.survey(sound, manifest))
         return Counter(map(Removal, decisions.removal.tolist()))
 
     return count
@@ -242,11 +234,6 @@ def test_contact_is_in_view_within_the_image_and_before_the_camera(p_CQ: Any, se
     K = np.array([[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]])
     p_CQ = np.array([[0.0, 0.0, 0.4], p_CQ, [np.nan] * 3])
     assert in_image(K, 33, p_CQ).tolist() == [True, seen, False]
-
-
-def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
-    assert assemble(out, overrides=[f"filters.max_slip={SLIP / 2}"]).removed == {Removal.SLID: 9}
-    assert assemble(out, overrides=["filters.require=held"]).removed == {Removal.KEPT: 9}
 
 
 @pytest.mark.parametrize("override", ["filters.require=held", "filters.max_slip=null"])

@@ -27,7 +27,7 @@ from helpers.datasets import (
     set_at,
 )
 
-from drakegrasp.dataset.assembly.samples import IMAGES
+from drakegrasp.dataset.assemble import IMAGES
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import DATA_FIELDS
 from drakegrasp.frames import invert_pose, pack_pose, unpack_pose
@@ -94,12 +94,12 @@ def test_a_wrong_value_of_a_trial_is_found(out: Path, cases: dict[int, str]) -> 
         name, _, edit, what = TRIAL_CASES[case]
         change(out, TRIALS, f"trials/{name}", row, edit)
         expected.append((TRIALS, "/trials", row, what))
-    must_find(out / TRIALS, *expected)
+    must_find(out, *expected, of=TRIALS)
 
 
 def test_a_removal_without_a_meaning_is_found(out: Path) -> None:
     change(out, TRIALS, "successes/removal", 2, lambda _: 14)  # was one, and is none
-    must_find(out / TRIALS, (TRIALS, "/successes", 2, "removal must be one of 0, 1, 2"))
+    must_find(out, (TRIALS, "/successes", 2, "removal must be one of 0, 1, 2"))
 
 
 PROPS, GRASP = "object_props/", "grasp_props/"
@@ -217,4 +217,4 @@ def test_cameras_of_a_sample_have_one_place_and_view(out: Path) -> None:
         props["frame_cam2work_otm"][2] = pack_pose(invert_pose(unpack_pose(packed)))
 
     edit_file(out / OTO, shift)
-    must_find(out / OTO, (OTO, "/test", 2, "both cameras must have the same place and view"))
+    must_find(out, (OTO, "/test", 2, "both cameras must have the same place and view"))

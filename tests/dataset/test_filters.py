@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.successes import good
+from helpers.successes import good, judge
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.filters import Removal, is_outlier
 
 
 def test_first_reason_counts() -> None:
     bad = good(3).with_columns(seen=np.zeros(3, bool), depth_variance=np.zeros(3))
-    assert np.all(judge_successes(bad, FilterConfig(), rejected=[0, 3, 6]) == Removal.NOT_SEEN)
+    assert np.all(judge(bad, FilterConfig(), rejected=[0, 3, 6]) == Removal.NOT_SEEN)
     worse = bad.with_columns(slip=np.ones(3), turn=np.ones(3), normal_angle=np.ones(3))
-    assert np.all(judge_successes(worse, FilterConfig()) == Removal.SLID)
+    assert np.all(judge(worse, FilterConfig()) == Removal.SLID)
     worst = worse.with_columns(other_links=np.ones(3, np.uint8))
-    assert np.all(judge_successes(worst, FilterConfig()) == Removal.OTHER_LINKS)
+    assert np.all(judge(worst, FilterConfig()) == Removal.OTHER_LINKS)
     nothing = worst.with_columns(complete=np.zeros(3, bool), grasp_T=np.full((3, 18), np.nan))
-    assert np.all(judge_successes(nothing, FilterConfig()) == Removal.MISSING_FINGER)
+    assert np.all(judge(nothing, FilterConfig()) == Removal.MISSING_FINGER)
 
 
 @pytest.mark.parametrize(
@@ -36,8 +35,8 @@ def test_first_reason_counts() -> None:
 def test_null_switches_a_limit_off(field: str, value: float, limit: str) -> None:
     successes = good(3).with_columns(**{field: np.full(3, value)})
     off = FilterConfig.model_validate({limit: None})
-    assert np.all(judge_successes(successes, FilterConfig()) != Removal.KEPT)
-    assert np.all(judge_successes(successes, off) == Removal.KEPT)
+    assert np.all(judge(successes, FilterConfig()) != Removal.KEPT)
+    assert np.all(judge(successes, off) == Removal.KEPT)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +69,7 @@ def test_each_limit_is_the_configured_one(
 ) -> None:
     """Values of which the usual limit would judge at least one otherwise, if another is set."""
     values = np.array([kept, removed, kept], dtype=good(3)[field].dtype)
-    found = judge_successes(good(3).with_columns(**{field: values}), FilterConfig(**settings))
+    found = judge(good(3).with_columns(**{field: values}), FilterConfig(**settings))
     assert found.tolist() == [Removal.KEPT, reason, Removal.KEPT]
 
 
@@ -81,9 +80,7 @@ def test_outliers_are_beyond_the_configured_number_of_deviations(
     """One of twenty is sqrt(19), some 4.4 deviations from the mean."""
     grasps = np.zeros((20, 18))
     grasps[7, 3] = 1.0
-    removal = judge_successes(
-        good(20).with_columns(grasp_T=grasps), FilterConfig(outlier_sigma=sigma)
-    )
+    removal = judge(good(20).with_columns(grasp_T=grasps), FilterConfig(outlier_sigma=sigma))
     assert np.flatnonzero(removal == Removal.OUTLIER).tolist() == ([7] if outlier else [])
 
 
@@ -92,7 +89,7 @@ def test_outliers_are_judged_among_the_grasps_that_are_left() -> None:
     grasps, slip = np.zeros((40, 18)), np.zeros(40)
     grasps[7, 3] = 1.0
     grasps[20:, 3], slip[20:] = np.linspace(-50.0, 50.0, 20), 1.0
-    removal = judge_successes(good(40).with_columns(grasp_T=grasps, slip=slip), FilterConfig())
+    removal = judge(good(40).with_columns(grasp_T=grasps, slip=slip), FilterConfig())
     assert removal[7] == Removal.OUTLIER
     assert np.all(removal[20:] == Removal.SLID)
     assert np.count_nonzero(removal == Removal.KEPT) == 19
@@ -118,8 +115,8 @@ def test_numbers_of_removals_are_those_in_files() -> None:
 def test_limits_of_suspicion_are_off_until_they_are_set(field: str, limit: str) -> None:
     values = np.array([0.1, 0.3, np.nan])
     successes = good(3).with_columns(**{field: values})
-    assert np.all(judge_successes(successes, FilterConfig()) == Removal.KEPT)
-    removal = judge_successes(successes, FilterConfig(**{limit: 0.2}))
+    assert np.all(judge(successes, FilterConfig()) == Removal.KEPT)
+    removal = judge(successes, FilterConfig(**{limit: 0.2}))
     assert removal.tolist() == [Removal.KEPT, Removal.SUSPICIOUS, Removal.SUSPICIOUS]
 
 
@@ -128,9 +125,9 @@ def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:
     bad = good(3).with_columns(
         other_links=np.full(3, 4, np.uint8), slip=np.ones(3), turn=np.full(3, 3.0)
     )
-    assert np.all(judge_successes(bad, held) == Removal.KEPT)
+    assert np.all(judge(bad, held) == Removal.KEPT)
     off = bad.with_columns(normal_angle=np.ones(3))
-    assert np.all(judge_successes(off, held) == Removal.NORMAL_OFF)
+    assert np.all(judge(off, held) == Removal.NORMAL_OFF)
 
 
 @pytest.mark.parametrize("name", ["grasp_T", "held_O"])
@@ -138,7 +135,7 @@ def test_normal_of_opposed_patches_is_off_the_surface(name: str) -> None:
     """Its length is zero, so that it has no direction: neither grasp of a sample may have one."""
     grasps = good(3).grasp_T.copy()
     grasps[1, 12] = np.nan
-    removal = judge_successes(good(3).with_columns(**{name: grasps}), FilterConfig())
+    removal = judge(good(3).with_columns(**{name: grasps}), FilterConfig())
     assert removal.tolist() == [Removal.KEPT, Removal.OFF_SURFACE, Removal.KEPT]
 
 
@@ -149,9 +146,7 @@ def test_outlier_is_judged_by_its_own_objects_population() -> None:
     objects = np.repeat([0, 1], 100).astype(np.int32)
     grasps[100:] += 50.0
     grasps[5, 17] = 50.0
-    removal = judge_successes(
-        successes.with_columns(object=objects, grasp_T=grasps), FilterConfig()
-    )
+    removal = judge(successes.with_columns(object=objects, grasp_T=grasps), FilterConfig())
     assert np.flatnonzero(removal == Removal.OUTLIER).tolist() == [5]
 
 
@@ -171,6 +166,6 @@ def test_no_finger_that_is_used_may_come_near_its_cone() -> None:
     unused = np.zeros((4, 3), dtype=bool)
     unused[3, 0] = True
     successes = good(4).with_columns(slip_use=use, unused=unused)
-    assert np.all(judge_successes(successes, FilterConfig()) == Removal.KEPT)
-    removal = judge_successes(successes, FilterConfig(max_slip_use=0.8))
+    assert np.all(judge(successes, FilterConfig()) == Removal.KEPT)
+    removal = judge(successes, FilterConfig(max_slip_use=0.8))
     assert removal.tolist() == [Removal.NEAR_CONE, Removal.KEPT, Removal.NEAR_CONE, Removal.KEPT]

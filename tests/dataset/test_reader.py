@@ -135,21 +135,6 @@ def test_a_file_that_another_program_writes_names_the_remedy(tmp_path: Path) -> 
     assert len(GraspDataset(path)) == 2
 
 
-def test_sample_is_printed_on_one_screen(data_file: Path) -> None:
-    sample = GraspDataset(data_file)[3]
-    lines = str(sample).splitlines()
-    assert len(lines) < 30 and max(map(len, lines)) <= 100
-    assert lines[0] == repr(sample)
-    assert repr(sample) == "Sample('object 3 ü', row 3 of train in grasping_oto.hdf5, trial 3)"
-    for text in (
-        "(4, 16, 16) float32, depth 3.000 to 3.000 m",
-        "256 px",
-        "slip 3",
-        "work2com (3,)",
-    ):
-        assert text in str(sample)
-
-
 def test_columns_come_whole(data_file: Path) -> None:
     data = GraspDataset(data_file)
     assert data.column("grasps").shape == (5, 18)

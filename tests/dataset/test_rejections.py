@@ -12,11 +12,9 @@ from drakegrasp.dataset.rejections import (
     AttemptKey,
     Decisions,
     read_decisions,
-    read_rejected,
     unused_rejections,
     write_decisions,
 )
-from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 
 A, B = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
@@ -28,7 +26,7 @@ def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
     decisions = Decisions().with_decision(B, "rejected").with_decision(A, "kept")
     write_decisions(path, decisions)
     assert read_decisions(path) == decisions
-    assert read_rejected(path) == [B]
+    assert read_decisions(path).rejected == {B}
     assert [p.name for p in tmp_path.iterdir()] == ["reject.json"]
 
 
@@ -42,24 +40,12 @@ def test_a_decision_replaces_the_one_before() -> None:
         rejected.with_decision(A, "no")
 
 
-def test_text_has_an_id_per_line(tmp_path: Path) -> None:
-    path = tmp_path / "list.txt"
-    path.write_text("# bad ones\n3\n\n12 # slides\n", encoding="utf-8")
-    assert read_rejected(path) == [3, 12]
-    path.write_text("3\nx\n", encoding="utf-8")
-    with pytest.raises(DataError, match="line 2: must be the id of a trial, got 'x'"):
-        read_rejected(path)
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(DataError, match="must be a text file"):
-        read_rejected(path)
-
-
 def test_keys_that_are_no_success_are_left_out(out: Path) -> None:
     """Of a failure, and of an object that is gone: the others count."""
     failure, gone = AttemptKey("1_box_a", 0, 1), AttemptKey("0_gone", 0, 0)
     path = out / "reject.json"
     write_decisions(path, Decisions(rejected=frozenset([A, failure, gone])))
-    given = read_rejected(path)
+    given = sorted(read_decisions(path).rejected)
     assert assemble(out, rejected=given).removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
     used = read_manifest(out).rejected
     assert used == (A,)

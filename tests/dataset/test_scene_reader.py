@@ -59,15 +59,6 @@ def test_points_lie_on_object_and_table(path: Path, frame: Any) -> None:
     assert np.abs(np.abs(p_OQ) - half).min(axis=1).max() < 1e-3
 
 
-def test_the_working_directory_may_change(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(path.parent)
-    data = SceneDataset(path.name, points=16)
-    monkeypatch.chdir(tmp_path)
-    assert same(data[1], SceneDataset(path, points=16)[1])
-
-
 def test_items_are_the_same_in_both_frames(path: Path) -> None:
     table, camera = (SceneDataset(path, points=64, frame=f)[5] for f in ("table", "camera"))
     for name in ("p_AQ", "points"):

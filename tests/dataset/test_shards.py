@@ -10,12 +10,12 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from helpers.shards import HEADER, some_shard
+from helpers.shards import HEADER, read_shard, some_shard
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION
-from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
+from drakegrasp.dataset.shards import trial_columns, write_shard
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import seal
 
@@ -40,11 +40,6 @@ def test_shard_comes_back_bit_by_bit(tmp_path: Path, trials: int, looks: int, se
     assert back.header == HEADER
     assert_same_bits(back.trials, shard.trials)
     assert_same_bits(back.looks, shard.looks)
-
-
-def test_path_tells_object_and_range(tmp_path: Path) -> None:
-    path = write_shard(tmp_path, some_shard())
-    assert path == tmp_path / "shards" / "24_mug_final" / "0000050-0000100.h5"
 
 
 def test_same_shard_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -83,13 +78,6 @@ def test_shard_holds_values_and_little_else(tmp_path: Path) -> None:
         stored = sum(column.id.get_storage_size() for column in columns)
     (path,) = tmp_path.glob("shards/*/*.h5")
     assert path.stat().st_size - stored < 600 * len(columns)
-
-
-def test_images_lie_one_to_a_chunk(tmp_path: Path) -> None:
-    """A loader reads single samples: it must not unpack their neighbours."""
-    with h5py.File(write_shard(tmp_path, some_shard())) as file:
-        for name in ("image_oto", "mask_oto", "image_otm", "mask_otm"):
-            assert file["looks"][name].chunks == (1, *file["looks"][name].shape[1:])
 
 
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.1, 0.5, 0.9, 0.999])

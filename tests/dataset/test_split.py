@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.assembly.split import (
+from drakegrasp.dataset.split import (
     SPLIT_NAMES,
     Home,
     find_homes,

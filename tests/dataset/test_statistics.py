@@ -4,40 +4,27 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change, make_dataset
-from helpers.hands import write_with_preshapes
+from helpers.datasets import SLIPPED, SUCCESS, TRIALS, change, make_dataset
 
-from drakegrasp.cli.tables import approach_line, funnel_table, hold_table, unfinished_line
-from drakegrasp.config import SplitConfig
+from drakegrasp.cli.tables import approach_line, funnel_table, hold_table
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.card import card_content
-from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
+from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.statistics import (
-    NO_NAME,
-    PreshapeCount,
-    SplitCount,
     count_funnel,
     count_splits,
-    count_unfinished,
     counts_as_dict,
     objects_without_samples,
-    preshapes_of,
-    split_shortfall,
-    why_no_sample,
 )
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
-from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.catalog import read_snapshot
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
@@ -53,58 +40,6 @@ def test_words_are_counted_by_object(out: Path) -> None:
     assert funnel.precision.tolist() == [2, 3, 3]
     assert funnel.stable.tolist() == [1, 3, 3]
     assert SLIPPED not in (SUCCESS, 3)
-
-
-def test_words_of_a_build_that_runs_are_those_of_its_shards(out: Path) -> None:
-    """The second shard of an object has one of its successes."""
-    (out / TRIALS).unlink()
-    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
-    unfinished = count_unfinished(out)
-    assert unfinished is not None
-    assert unfinished.funnel.precision.tolist() == [3, 2, 3]
-    assert unfinished.funnel.stable.tolist() == [3, 2, 3]
-    assert not unfinished.funnel.removals[:, Removal.KEPT].any()
-
-
-def test_build_with_a_target_runs_as_many_units_as_it_needs(out: Path) -> None:
-    """Its number of units is not known before; what was tried is counted, not what was drawn."""
-    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
-    manifest = read_manifest(out)
-    manifest = replace(manifest, config=manifest.config.model_copy(update={"samples": 9}))
-    write_manifest(manifest, out)
-    unfinished = count_unfinished(out)
-    assert unfinished is not None
-    assert (unfinished.done, unfinished.total) == (5, None)
-    assert unfinished.funnel.candidates.tolist() == [4, 2, 4]
-    assert unfinished_line(unfinished) == (
-        "not finished: 5 work units are done; samples are chosen at the end"
-    )
-    assert counts_as_dict(out)["unfinished"] == {"done": 5, "total": None}
-
-    # When it is met, the number is known.
-    met = tuple(replace(entry, tried=2) for entry in manifest.objects)
-    write_manifest(replace(manifest, objects=met), out)
-    unfinished = count_unfinished(out)
-    assert unfinished is not None
-    assert (unfinished.done, unfinished.total) == (3, 3)
-    assert "`drakegrasp assemble` writes them" in unfinished_line(unfinished)
-
-
-def test_attempts_are_counted_by_preshape(out: Path, tmp_path: Path) -> None:
-    """Of the second preshape a success that is stable and one that is not, and a missed attempt."""
-    for row in (SUCCESS, 3, MISSING):
-        change(out, TRIALS, "trials/preshape", row, lambda _: 1)
-    change(out, TRIALS, "trials/stable", 3, lambda _: False)
-    change(out, TRIALS, "trials/preshape", SLIPPED, lambda _: NO_PRESHAPE)
-    funnel = count_funnel(out)
-    hand = write_with_preshapes(tmp_path, all="F1 F2 F3", pair="F1 F3")
-    counts = preshapes_of(funnel, load_config(overrides=[f"hand={hand}"]))
-    assert counts == [
-        PreshapeCount("all", 32, 7, 7, 7),
-        PreshapeCount("pair", 3, 2, 1, 2),
-        PreshapeCount(NO_NAME, 1, 0, 0, 0),
-    ]
-    assert preshapes_of(funnel, load_config()) == []
 
 
 def test_samples_are_as_many_wherever_they_are_counted(
@@ -135,10 +70,7 @@ def test_samples_are_as_many_wherever_they_are_counted(
     counts = counts_as_dict(out)
     assert {each["name"]: each["samples"] for each in counts["objects"]} == found
 
-    # The card, the figures and the page.
-    card = card_content(out)["counts"]
-    assert {name: row["samples"] for name, row in card["objects"].items()} == found
-    assert card["all"]["samples"] == total
+    # The figures and the page.
     write_figures(out, tmp_path / "figures")
     numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
     assert numbers["outcomes"]["samples"] == total
@@ -190,7 +122,7 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     assert funnel.elevations[1:].tolist() == before.elevations[1:].tolist()
     total = int(funnel.distinct.sum())
 
-    # In the table and its line, of each split, in JSON and on the card.
+    # In the table and its line, of each split, and in JSON.
     table = funnel_table(funnel)
     assert list(table.columns[-1].cells) == [*map(str, funnel.distinct.tolist()), str(total)]
     assert approach_line(funnel).startswith(f"{total} distinct grasps in ")
@@ -199,10 +131,6 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     assert said["objects"][0]["distinct"] == said["objects"][0]["approach_cells"] == 2
     assert said["objects"][0]["elevations"] == {"0-30": 1, "30-60": 0, "60-90": 1}
     assert sum(split["distinct"] for split in said["splits"]) == total
-    card = card_content(out)["counts"]
-    assert card["objects"]["1_box_a"]["distinct"] == 2
-    assert card["all"]["distinct"] == sum(card["approaches"]["elevations"].values()) == total
-    assert sum(split["distinct"] for split in card["splits"].values()) == total
 
     # In another resting pose it is another grasp.
     change(out, TRIALS, "trials/resting", int(rows[1]), lambda _: 1)
@@ -227,91 +155,16 @@ def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
     assert (train.samples, train.objects, train.classes) == (9, 3, 2)
 
 
-@pytest.mark.parametrize(
-    ("outcomes", "removals", "reason"),
-    [
-        (
-            {Outcome.START_COLLISION: 842, Outcome.SCREENED: 358},
-            {},
-            "842 of 1,200 attempts (70%) end in start_collision, "
-            f"{Outcome.START_COLLISION.text}; the hand never closed on it",
-        ),
-        ({Outcome.SCREENED: 9, Outcome.HAND_CONTACT: 1}, {}, "; closed: 1, none lifted"),
-        ({Outcome.START_COLLISION: 9, Outcome.MOVED: 3}, {}, "; lifted: 3, none held"),
-        (
-            {Outcome.DROPPED: 9, Outcome.SCREENED: 3},
-            {},
-            "9 of 12 attempts (75%) end in dropped, the hand loses the object during the lift",
-        ),
-        ({Outcome.DROPPED: 9, Outcome.SUCCESS: 2}, {Removal.TURNED: 2}, "mostly turned (2)"),
-    ],
-)
-def test_reason_is_what_most_attempts_met_and_how_far_the_best_came(
-    outcomes: dict[Outcome, int], removals: dict[Removal, int], reason: str
-) -> None:
-    tried, removed = np.zeros(1 + max(Outcome), int), np.zeros(1 + max(Removal), int)
-    tried[list(outcomes)] = list(outcomes.values())
-    removed[list(removals)] = list(removals.values())
-    assert why_no_sample(tried, removed, load_config()).reason.endswith(reason)
-
-
-def test_advice_names_no_way_that_was_gone_already() -> None:
-    tried, removed = np.zeros(1 + max(Outcome), int), np.zeros(1 + max(Removal), int)
-    tried[Outcome.START_COLLISION] = 10
-    ways = ("candidates.method=normals", "objects.resting_poses=4", "hand=NAME")
-    first = why_no_sample(tried, removed, load_config()).advice
-    assert all(way in first for way in ways)
-    config = load_config(overrides=["candidates.method=normals", "objects.resting_poses=3"])
-    then = why_no_sample(tried, removed, config).advice
-    assert [way in then for way in ways] == [False, False, True]
-    assert "--candidates" in then
-    tried[Outcome.SUCCESS] = removed[Removal.FLAT_DEPTH] = 2
-    assert "filters.min_depth_variance=0`" in why_no_sample(tried, removed, config).advice
-
-
-def test_objects_without_samples_are_named(sound: Path) -> None:
+def test_objects_without_samples_say_how_most_attempts_ended(sound: Path) -> None:
     funnel = count_funnel(sound)
-    assert not objects_without_samples(funnel, load_config())
-    funnel.removals[1, Removal.KEPT] = 0
-    assert list(objects_without_samples(funnel, load_config())) == [funnel.names[1]]
-
-
-def counts(train: int, valid: int, test: int) -> list[SplitCount]:
-    numbers = {"train": train, "valid": valid, "test": test}
-    return [
-        SplitCount(split=name, samples=n, distinct=n, objects=min(n, 1), classes=1)
-        for name, n in numbers.items()
-    ]
-
-
-def test_split_that_is_not_as_asked_is_told() -> None:
-    config = SplitConfig()
-    (told,) = split_shortfall(counts(24, 43, 8), "object", config)
-    assert "train 32% (75%), valid 57% (10%), test 11% (15%)" in told
-    assert "3 objects have samples" in told
-    assert split_shortfall(counts(75, 10, 15), "object", config) == []
-
-    # By class the test has the share that it has.
-    assert split_shortfall(counts(20, 2, 90), "class", config) == []
-
-
-def test_each_empty_split_has_a_line() -> None:
-    config, none = SplitConfig(), SplitConfig(valid_fraction=0.0)
-    few = "has samples, and three fill all splits"
-    assert split_shortfall(counts(60, 0, 0), "object", config) == [
-        f"split {name} is empty: 1 object {few}" for name in ("valid", "test")
-    ]
-    # There are enough objects, but they were in other splits.
-    more = [replace(count, objects=3 * count.objects) for count in counts(60, 0, 15)]
-    (line,) = split_shortfall(more, "object", config)
-    assert line.startswith("split valid is empty: objects stay in the split in which they were ")
-    assert "assemble OUT --set split.seed=1" in line
-    assert split_shortfall(counts(85, 0, 15), "object", none) == []
-
-    # By class, too.
-    (line,) = split_shortfall(counts(4, 0, 2), "class", config)
-    assert line.startswith("split valid is empty: more samples ")
-    (train, valid) = split_shortfall(counts(0, 0, 9), "class", config)
-    assert train.startswith("split train is empty: a class trains if two of its objects ")
-    assert valid.startswith("split valid is empty: ")
-    assert split_shortfall(counts(0, 0, 0), "class", config) == []
+    assert not objects_without_samples(funnel)
+    for array in (funnel.removals, funnel.outcomes):
+        array[:] = 0
+    funnel.outcomes[1, [Outcome.START_COLLISION, Outcome.SCREENED]] = 842, 358
+    funnel.outcomes[2, [Outcome.DROPPED, Outcome.SUCCESS]] = 9, 2
+    funnel.removals[2, Removal.TURNED] = 2
+    assert objects_without_samples(funnel) == {
+        "1_box_a": "nothing was tried",
+        "2_box_b": "842 of 1,200 attempts end in start_collision",
+        "3_brick": "2 held, mostly turned (2)",
+    }

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import pickle
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import OTO, SUCCESS, TRIALS, edit_file
+from helpers.datasets import OTO, TRIALS, edit_file
 
 from drakegrasp.dataset import trials as trials_module
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.trials import NONE, Trials
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.outcomes import Outcome
 
@@ -94,17 +92,6 @@ def test_choice_is_of_what_was_asked_for(
     assert Trials(sound).where(**filters).trial_ids.tolist() == rows.tolist()
 
 
-def test_choices_of_choices_are_narrower(sound: Path) -> None:
-    held = Trials(sound).where(outcome="success")
-    own = held.where(object_name="3_brick", sample=True)
-    assert own.trial_ids.tolist() == [24, 27, 35]
-    assert held.where(object_name="3_brick", sample=False).trial_ids.tolist() == []
-    assert own[1:].trial_ids.tolist() == [27, 35]
-    assert own[[2, 0]]["trial_id"].tolist() == [35, 24]
-    assert own[own["trial_id"] > 30].trial_ids.tolist() == [35]
-    assert own[-1]["trial_id"] == own[2]["trial_id"] == 35
-
-
 def test_removed_success_is_no_sample(out: Path) -> None:
     assemble(out, rejected=[27])
     own = Trials(out).where(outcome="success", object_name="3_brick")
@@ -170,27 +157,6 @@ def test_contacts_of_another_moment_or_frame_are_refused(sound: Path) -> None:
         Trials(sound).contacts(frame="camera")
 
 
-def test_data_frame_has_a_row_per_attempt(sound: Path) -> None:
-    pytest.importorskip("pandas")
-    trials = Trials(sound).where(object_name="2_box_b")
-    frame = trials.to_pandas()
-    assert frame.index.tolist() == list(range(12, 24))
-    assert frame.loc[12, "outcome"] == "success"
-    assert frame["slip"].tolist()[:1] == trials["slip"].tolist()[:1]
-    assert frame["object_name"].cat.categories.tolist() == ["2_box_b"]
-    wide = trials.to_pandas(["closed_p_OQ"])
-    assert [*wide] == [f"closed_p_OQ.{i}" for i in range(9)]
-    np.testing.assert_array_equal(wide.to_numpy(), trials["closed_p_OQ"].reshape(12, 9))
-
-
-def test_data_frame_without_pandas_is_one_line(
-    sound: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(MachineError, match="to_pandas needs pandas, got none: pip install pandas"):
-        Trials(sound).to_pandas()
-
-
 def test_file_that_was_replaced_is_refused(out: Path) -> None:
     trials = Trials(out)
     shutil.copy(out / TRIALS, out / "other")
@@ -210,29 +176,3 @@ def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
     edit_file(out / TRIALS, lambda f: f["trials/object"].write_direct(np.full(36, 3, "i4")))
     with pytest.raises(DataError, match="/trials/object must be 0 to 2, got 3 in row 0"):
         Trials(out)["object_name"]
-
-
-def test_name_that_no_file_can_have_is_only_shown(out: Path) -> None:
-    def rename(file: h5py.File) -> None:
-        file["objects/name"][0] = "../mug"
-
-    edit_file(out / TRIALS, rename)
-    with pytest.raises(DataError, match=r"a name must be .*, got '\.\./mug'"):
-        Trials(out)
-    assert Trials(out, any_name=True)[0]["object_name"] == "../mug"
-
-
-def test_trials_may_be_sent_to_another_process(sound: Path) -> None:
-    held = Trials(sound / TRIALS).where(outcome="success")
-    again = pickle.loads(pickle.dumps(held))
-    assert again.trial_ids.tolist() == held.trial_ids.tolist()
-    assert again[0]["trial_id"] == SUCCESS
-
-
-def test_the_working_directory_may_change(
-    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(sound.parent)
-    trials = Trials(sound.name)
-    monkeypatch.chdir(tmp_path)
-    assert len(trials.columns(("outcome",))["outcome"]) == len(trials)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -18,15 +17,11 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, DiskFullError
 from drakegrasp.exchange import dexgraspbench
 from drakegrasp.exchange.export import ClosedGrasp, export_dataset
-from drakegrasp.exchange.meshes import PLACE
-from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.model import load_object, prepare_object
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.simulation.attempts import quaternion_poses
 
 
 def test_closed_grasps_are_the_samples_of_all_splits(
@@ -112,25 +107,14 @@ def test_numbers_that_are_not_finite_are_one_line(
     assert not (tmp_path / "to").exists()
 
 
-def test_meshes_are_in_the_frame_of_the_objects_with_a_table_of_their_rows(
+def test_meshes_are_in_the_frame_of_the_objects(
     dataset: Path, exported: Callable[[str], Path]
 ) -> None:
-    folder, trials, entries = exported("meshes"), Trials(dataset), read_manifest(dataset).objects
-    for split in ("train", "valid", "test"):
-        data = GraspDataset(dataset / "grasping_oto.hdf5", split=split)
-        with (folder / f"rows_{split}.csv").open(newline="") as text:
-            rows = list(csv.DictReader(text))
-        assert [int(row["row"]) for row in rows] == list(range(len(data)))
-        places = np.array([[float(row[name]) for name in PLACE] for row in rows])
-        X_TO, _ = quaternion_poses(places[:, :3], places[:, 3:])
-        of_rows = trials[data.column("trial_id")]
-        np.testing.assert_allclose(X_TO, unpack_pose(of_rows["X_TO"]), atol=1e-12)
-        for name in ("mass", "friction_hand", "friction_table"):
-            np.testing.assert_array_equal([float(row[name]) for row in rows], of_rows[name])
-        for row in rows:
-            model = load_object(model_path(dataset, row["object"]))
-            mesh = trimesh.load(folder / row["file"], process=False)
-            np.testing.assert_array_equal(mesh.vertices, model.visual_vertices)
+    folder, entries = exported("meshes"), read_manifest(dataset).objects
+    for entry in entries:
+        mesh = trimesh.load(folder / f"{entry.name}.obj", process=False)
+        model = load_object(model_path(dataset, entry.name))
+        np.testing.assert_array_equal(mesh.vertices, model.visual_vertices)
 
     # A build makes the same objects of the folder, whose lengths are in metres.
     for source, entry in zip(find_meshes(folder), entries, strict=True):

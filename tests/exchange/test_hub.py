@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.commands import run
+from helpers.datasets import change
 from PIL import Image
 
 from drakegrasp.dataset.reader import GraspDataset
@@ -26,6 +27,7 @@ from drakegrasp.dataset.schema import (
     VIEW_FIELDS,
     Field,
 )
+from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.exchange import hub
 from drakegrasp.exchange.export import export_dataset
@@ -161,9 +163,7 @@ def test_datasets_loads_what_the_files_hold(with_scenes: Path, tmp_path: Path) -
             assert said["scene"] == [row["scene"] for row in rows]
 
 
-def test_card_names_licence_and_files_and_is_that_of_the_dataset(
-    dataset: Path, folder: Path
-) -> None:
+def test_card_names_licence_files_and_samples(dataset: Path, folder: Path) -> None:
     head, text = (folder / "README.md").read_text(encoding="utf-8").split("---\n")[1:]
     described = yaml.safe_load(head)
     assert described["license"] == "cc-by-4.0"
@@ -171,12 +171,14 @@ def test_card_names_licence_and_files_and_is_that_of_the_dataset(
     for config in described["configs"]:
         for entry in config["data_files"]:
             assert list(folder.glob(entry["path"]))
-    own = (dataset / "DATACARD.md").read_text(encoding="utf-8")
-    assert own[own.index("## How it was made") :] in text
+    assert described["pretty_name"] == "Simulated grasps of 3 objects"
+    for count in count_splits(dataset):
+        assert f"| {count.split} | {count.samples} | {count.distinct} |" in text
+    assert "* not stated: 1_box_a, 2_box_b, 3_brick" in text
     assert str(GraspDataset(dataset / "grasping_oto.hdf5").K.tolist()) in text
     assert "it is 0.75 m" in " ".join(text.split())
     for absent in ("trials.hdf5", "manifest.json", "grasping_o"):
-        assert absent not in text.partition("## How it was made")[0]
+        assert absent not in text
 
 
 def test_long_splits_are_cut_into_files(
@@ -188,6 +190,13 @@ def test_long_splits_are_cut_into_files(
     assert len(list((tmp_path / "to" / "oto").glob("test-*.parquet"))) == -(-len(data) // 2) > 1
     ids = [row["trial_id"] for row in table_of(tmp_path / "to", "oto", "test")]
     assert ids == data.column("trial_id").tolist()
+
+
+def test_seeds_of_64_bits_are_exported(dataset: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(dataset, tmp_path / "out"))
+    change(out, "grasping_oto.hdf5", "test/conditions/depth_seed", 0, lambda _: 2**64 - 1)
+    export_dataset(out, tmp_path / "to", "hf")
+    assert table_of(tmp_path / "to", "oto", "test")[0]["depth_seed"] == 2**64 - 1
 
 
 @pytest.mark.sim

@@ -18,7 +18,6 @@ pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.exchange.attempts import holds_postures
 from drakegrasp.exchange.dexgraspbench import OBJECTS, fitted_postures, write_grasps
 from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.frames import invert_pose
@@ -208,14 +207,6 @@ def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_
     assert told == [(0, 2), (1, 2), (2, 2)] and sent == [2, 2]
     made = sorted(path.name for path in (tmp_path / "to" / OBJECTS).iterdir())
     assert made == sorted(model.name for model in models[:2])
-
-
-def test_what_a_file_holds_is_told_from_its_content(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((1, 18)))
-    (tmp_path / "a.csv").write_text("1,2,3\n")
-    (tmp_path / "b.csv").write_text("object,x\nmug,1\n")
-    found = [holds_postures(tmp_path / name) for name in ("a.npy", "a.csv", "b.csv", "b.npz")]
-    assert found == [False, False, True, True]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ grasps are of two preshapes, and friction and mass are not those of the configur
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +21,6 @@ from helpers.builds import build
 from helpers.commands import run
 from helpers.datasets import OTO
 from helpers.tiers import in_second_tier
-from scipy.spatial.transform import Rotation
 
 from drakegrasp import registry
 from drakegrasp.dataset.check import check_dataset
@@ -40,6 +38,7 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.scoring.run import VERDICTS
+from drakegrasp.simulation.attempts import CONDITIONS
 from drakegrasp.simulation.posture import joint_order
 
 NAME, HAND = "1_brick_a", "allegro_four"
@@ -64,7 +63,7 @@ SAMPLES = (
 #: which no posture of the hand is read.
 ONLY_OUT = {"hf", "original", "meshes", "glb", "mjcf"}
 #: Layouts of postures that users write.
-OWN = ("npz", "hdf5", "csv", "parquet")
+OWN = ("npz", "hdf5")
 
 
 @pytest.fixture(scope="module")
@@ -122,29 +121,13 @@ def write_own(path: Path, samples: Trials) -> Path:
         "object": [NAME] * len(q), "row": np.arange(len(q)), "resting": samples["resting"],
         "preshape": names, "mass": samples["mass"], "friction_hand": samples["friction_hand"],
     }  # fmt: skip
-    if path.suffix in (".npz", ".hdf5"):
-        content |= {"X_FG": X_OG, "q_grasp": q, "q_pregrasp": opened}
-        if path.suffix == ".npz":
-            np.savez(path, **content)
-        else:
-            with h5py.File(path, "w") as file:
-                for name, values in content.items():
-                    file[name] = values
-        return path
-    quaternions = Rotation.from_matrix(X_OG[:, :3, :3]).as_quat(scalar_first=True)
-    content |= dict(zip("xyz", X_OG[:, :3, 3].T, strict=True))
-    content |= dict(zip(("qw", "qx", "qy", "qz"), quaternions.T, strict=True))
-    for stage, values in (("grasp", q), ("pregrasp", opened)):
-        content |= {f"{stage}_{n}": v for n, v in zip(order, values.T, strict=True)}
-    columns = {name: np.asarray(values).tolist() for name, values in content.items()}
-    if path.suffix == ".csv":
-        with path.open("w", newline="") as text:
-            csv.writer(text).writerows([columns, *zip(*columns.values(), strict=True)])
+    content |= {"X_FG": X_OG, "q_grasp": q, "q_pregrasp": opened}
+    if path.suffix == ".npz":
+        np.savez(path, **content)
     else:
-        pyarrow = pytest.importorskip("pyarrow")
-        from pyarrow import parquet
-
-        parquet.write_table(pyarrow.table(columns), path)
+        with h5py.File(path, "w") as file:
+            for name, values in content.items():
+                file[name] = values
     return path
 
 
@@ -277,32 +260,23 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
 def test_palms_on_exported_meshes_are_the_same_trials(
     out: Path, samples: Trials, written: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    """A network adds poses in the frame of `file` to the table of rows, and nothing else."""
+    """Of the palm link, of samples in the third resting pose and of another."""
     folder, hand = written("meshes"), load_hand(HAND)
-    with (folder / "rows_train.csv").open(newline="") as text:
-        rows = list(csv.DictReader(text))
-
-    # Poses of the palm link, of samples in the third resting pose and of another.
     chosen = [*np.flatnonzero(samples["resting"] == 2)[:2], 0]
     X_OB = unpack_pose(samples["X_OG"]) @ np.linalg.inv(hand.X_BG)
-    with (tmp_path / "palms.csv").open("w", newline="") as text:
-        table = csv.DictWriter(
-            text, [*rows[0], *("x", "y", "z", "qw", "qx", "qy", "qz"), "preshape"]
-        )
-        table.writeheader()
-        for i in chosen:
-            turn = Rotation.from_matrix(X_OB[i, :3, :3]).as_quat(scalar_first=True)
-            pose = dict(
-                zip(("x", "y", "z", "qw", "qx", "qy", "qz"), [*X_OB[i, :3, 3], *turn], strict=True)
-            )
-            table.writerow(
-                {**rows[i], **pose, "preshape": hand.preshape_names[samples["preshape"][i]]}
-            )
+    np.savez(
+        tmp_path / "palms.npz",
+        X_FG=X_OB[chosen],
+        object=[NAME] * len(chosen),
+        row=np.array(chosen, dtype=np.int64),
+        preshape=[hand.preshape_names[samples["preshape"][i]] for i in chosen],
+        **{name: samples[name][chosen] for name in ("resting", *CONDITIONS)},
+    )
 
     # On the rows of the dataset, and on the mesh that was exported, of whose unit nothing is said.
     rules = [word for rule in (*RULES, *OBJECTS) for word in ("--set", rule)]
     onto = ("--object", folder / f"{NAME}.obj", "--frame", "mesh", "--config", "fast", *rules)
     for where in (("--dataset", out / OTO, "--split", "train"), onto):
-        found = verified(tmp_path / "palms.csv", *where, "--link", hand.palm_link)
+        found = verified(tmp_path / "palms.npz", *where, "--link", hand.palm_link)
         assert [v["outcome"] for v in found] == ["success"] * len(chosen)
         np.testing.assert_allclose([v["slip"] for v in found], samples["slip"][chosen], rtol=0.1)

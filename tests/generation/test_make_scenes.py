@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from drakegrasp.dataset.card import card_content
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.scenes import make_scenes, split_objects
@@ -41,23 +38,12 @@ def test_bytes_do_not_depend_on_the_number_of_workers(scenes: Path, out: Path) -
     assert (out / "scenes.hdf5").read_bytes() == scenes.read_bytes()
 
 
-def test_card_counts_them_as_long_as_they_are_of_the_dataset(scenes: Path, out: Path) -> None:
-    with h5py.File(scenes) as file:
-        splits = file["scenes/split"][:]
-        tested = splits[file["grasps/scene"][:]][file["grasps/tested"][:]]
-    card = json.loads((scenes.parent / CARD_FILES[0]).read_text(encoding="utf-8"))
-    counted = [(row["scenes"], row["tested"]) for row in card["scenes"].values()]
-    assert counted == [((splits == i).sum(), (tested == i).sum()) for i in range(3)]
-    text = (scenes.parent / CARD_FILES[1]).read_text(encoding="utf-8")
-    assert f"| test | {card['scenes']['test']['scenes']} |" in text.partition("## Scenes")[2]
-    # Those of other trials, and damaged ones.
-    shutil.copy(scenes, out)
-    assert card_content(out)["scenes"] == card["scenes"]
-    with h5py.File(out / scenes.name, "r+") as file:
-        file.attrs["shards"] = "others"
-    assert "scenes" not in card_content(out)
-    (out / scenes.name).write_bytes(b"no file")
-    assert "scenes" not in card_content(out)
+def test_nothing_else_of_the_dataset_changes(sound: Path, scenes: Path) -> None:
+    names = {path.name for path in scenes.parent.iterdir()} - {"build.lock"}
+    assert names == {path.name for path in sound.iterdir()} | {"scenes.hdf5"}
+    for path in sound.iterdir():
+        if path.is_file():
+            assert path.read_bytes() == (scenes.parent / path.name).read_bytes()
 
 
 def test_objects_are_turned_and_moved_and_cameras_differ_by_split(scenes: Path) -> None:

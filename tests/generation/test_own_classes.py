@@ -16,12 +16,11 @@ from helpers.builds import build
 from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from helpers.meshes import SMALL, write_fixed
-from helpers.successes import good
+from helpers.successes import good, judge
 from starlette.testclient import TestClient
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
@@ -268,7 +267,7 @@ def test_what_is_no_verdict_is_refused_in_one_line(
     Path("mine.py").write_text("\n".join([*lines, f"    return {value}"]))
     config = load_config(overrides=["filters.own=mine.py:Mine"])
     with pytest.raises(ConfigError, match=message) as caught:
-        judge_successes(good(3), config.filters)
+        judge(good(3), config.filters)
     assert "\n" not in str(caught.value)
 
 

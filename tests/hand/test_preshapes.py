@@ -9,10 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from helpers.successes import good
+from helpers.successes import good, judge
 
 from drakegrasp.config import CandidateConfig, FilterConfig
-from drakegrasp.dataset.assembly.removal import judge_successes
 from drakegrasp.errors import HandError
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.export import ClosedGrasp
@@ -147,7 +146,7 @@ def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:
     grasp[3, 4] = np.nan
     grasp[6, 4] = grasp[30, 0] = 50.0
     shaped = grasps.with_columns(grasp_T=grasp, held_O=held, unused=unused)
-    removal = judge_successes(shaped, FilterConfig())
+    removal = judge(shaped, FilterConfig())
     assert np.flatnonzero(removal).tolist() == [3, 6, 30]
     assert removal[3] == Removal.OFF_SURFACE
     assert removal[6] == removal[30] == Removal.OUTLIER

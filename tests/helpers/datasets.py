@@ -345,13 +345,16 @@ def mirrored(values: np.ndarray) -> np.ndarray:
     return pack_pose(unpack_pose(values) @ np.diag([1.0, 1.0, -1.0, 1.0]))
 
 
-def found(path: Path) -> set[tuple[str, str, int | None, str]]:
-    return {(v.file, v.group, v.row, v.what) for v in check_dataset(path)}
+def found(out: Path) -> set[tuple[str, str, int | None, str]]:
+    return {(v.file, v.group, v.row, v.what) for v in check_dataset(out)}
 
 
-def must_find(path: Path, *expected: tuple[str, str, int | None, str]) -> None:
-    """Require exactly these violations: file, group, row, and how the text begins."""
-    hits = found(path)
+def must_find(out: Path, *expected: tuple[str, str, int | None, str], of: str = "") -> None:
+    """Require exactly these violations: file, group, row, and how the text begins.
+
+    With `of`, those of this file alone: what follows from them in others is not looked at.
+    """
+    hits = {hit for hit in found(out) if of in ("", hit[0])}
     missing = [
         e for e in expected if not any(h[:3] == e[:3] and h[3].startswith(e[3]) for h in hits)
     ]

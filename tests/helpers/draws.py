@@ -20,7 +20,7 @@ import trimesh
 from threadpoolctl import threadpool_info
 
 from drakegrasp.config import BuiltinConfig, SplitConfig
-from drakegrasp.dataset.assembly.split import find_homes, split_samples
+from drakegrasp.dataset.split import find_homes, split_samples
 from drakegrasp.frames import make_pose
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand

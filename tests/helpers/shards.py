@@ -1,16 +1,20 @@
-"""A shard of random values."""
+"""A shard of random values, and one that is read whole."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.hdf5 import read_columns
 from drakegrasp.dataset.schema import LOOK_FIELDS, Field, sizes
-from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns
+from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, trial_columns
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.files import refuse_broken_seal
 
 SIZES = sizes(fingers=3, joints=8, image=8)
 
@@ -46,3 +50,17 @@ def some_shard(*, trials: int = 12, looks: int = 3, seed: int = 0) -> Shard:
         trials={**shard.trials, "outcome": outcome},
         looks={**shard.looks, "row": np.arange(looks, dtype=np.int32)},
     )
+
+
+def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
+    """Return a shard; without a header, that of any work unit."""
+    if header is None:
+        refuse_broken_seal(path)
+        with h5py.File(path) as file:
+            header = ShardHeader(**{name: file.attrs[name] for name in HEADER.stored})
+    with open_shard(path, header) as file:
+        return Shard(
+            header=header,
+            trials=read_columns(file["trials"], trial_columns()),
+            looks=read_columns(file["looks"], LOOK_FIELDS),
+        )

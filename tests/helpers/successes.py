@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.config import FilterConfig
+from drakegrasp.dataset.successes import judge_successes
+from drakegrasp.filters import first_removal
 from drakegrasp.table import Table
 
 
@@ -35,3 +41,11 @@ def good(count: int) -> Table:
         imbalance=np.full(count, 0.01),
         normal_sum=np.full(count, 0.3),
     )
+
+
+def judge(
+    successes: Table, config: FilterConfig, rejected: Sequence[int] = ()
+) -> npt.NDArray[np.uint8]:
+    """Return why each is no sample, by the rules and by what needs all of them."""
+    by_rule = first_removal(successes, config)
+    return judge_successes(successes.with_columns(by_rule=by_rule), config, rejected)

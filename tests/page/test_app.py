@@ -22,7 +22,7 @@ from helpers.pages import ATTACK, Tags, coded, get, numbered, open_pages, state_
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
+from drakegrasp.dataset.rejections import AttemptKey, read_decisions
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.page.app import HEADERS, TOKEN_HEADER, Inspection, make_app
@@ -139,7 +139,7 @@ def test_decisions_are_on_disk_at_once_and_undone(client: TestClient, out: Path)
 def test_assembly_drops_exactly_the_rejected(client: TestClient, out: Path) -> None:
     for label in ("0-0-0", "2-3-2"):
         decide(client, label, "rejected")
-    assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
+    assembly = assemble(out, rejected=sorted(read_decisions(out / "reject.json").rejected))
     assert assembly.removed == {Removal.KEPT: 7, Removal.REJECTED: 2}
     assert "run inspect again" in client.get("/").text
     again = open_pages(out)

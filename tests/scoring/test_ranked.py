@@ -8,7 +8,7 @@ import pytest
 from helpers.scores import ranked_array
 
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.contacts import read_contacts
+from drakegrasp.exchange.columns import read_contacts
 
 GRASPS = np.arange(2 * 3 * 18, dtype=float).reshape(2, 3, 18)
 
@@ -39,7 +39,7 @@ def test_bad_numbers_stay_as_they_are_failures_of_the_network():
     assert np.isnan(ranked_array("a", np.full((2, 18), np.nan), length=2).grasps).all()
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".h5", ".parquet"])
+@pytest.mark.parametrize("suffix", [".npy", ".h5"])
 def test_all_formats_give_the_same_predictions(tmp_path, suffix):
     path, flat, confidence = tmp_path / f"p{suffix}", GRASPS.reshape(6, 18), np.arange(6.0)
     rows = np.array([4, 4, 4, 7, 7, 7])
@@ -48,15 +48,8 @@ def test_all_formats_give_the_same_predictions(tmp_path, suffix):
         ranked = ranked_array("a", **read_contacts(path, axes=3), length=2)
         np.testing.assert_array_equal(ranked.grasps, flat)
         return
-    if suffix == ".h5":
-        with h5py.File(path, "w") as file:
-            file["test/grasps"], file["test/rows"], file["test/confidence"] = flat, rows, confidence
-    else:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        table = {"grasps": flat.tolist(), "rows": rows, "confidence": confidence}
-        pq.write_table(pa.table(table), path)
+    with h5py.File(path, "w") as file:
+        file["test/grasps"], file["test/rows"], file["test/confidence"] = flat, rows, confidence
     ranked = ranked_array("a", **read_contacts(path, split="test"), length=9)
     assert ranked.of_row.tolist() == rows.tolist()
     np.testing.assert_array_equal(ranked.grasps, flat[[2, 1, 0, 5, 4, 3]])
@@ -77,7 +70,7 @@ def test_what_does_not_fit_is_refused(rows, confidence, message):
         ranked_array("a", GRASPS, length=5, rows=rows, confidence=confidence)
 
 
-@pytest.mark.parametrize("name", ["a.npy", "a.h5", "a.parquet", "a.txt"])
+@pytest.mark.parametrize("name", ["a.npy", "a.h5", "a.txt"])
 def test_a_file_of_something_else_is_refused_by_name(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(b"something else")

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.columns import read_numbers
-from drakegrasp.exchange.contacts import read_contacts
+from drakegrasp.exchange.columns import read_contacts, read_numbers
 
 NUMBERS = np.random.default_rng(0).normal(size=(4, 18)).round(6)
 
@@ -21,20 +20,6 @@ def _npy(path):
 def _npy_single(path):
     np.save(path / "grasps.npy", NUMBERS.astype(np.float32))
     return path / "grasps.npy"
-
-
-def _csv(path):
-    np.savetxt(path / "grasps.csv", NUMBERS, delimiter=",", fmt="%.6f")
-    return path / "grasps.csv"
-
-
-def _csv_with_header(path):
-    """As a spreadsheet writes it: a mark, a header, Windows' line ends and an empty line."""
-    file = _csv(path)
-    head = ",".join(f"p{i}" for i in range(18))
-    text = "\n".join([head, *file.read_text().splitlines(), ""])
-    file.write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
-    return file
 
 
 def _hdf5(path):
@@ -51,9 +36,7 @@ def _hdf5_in_a_group(path):
     return path / "GRASPS.HDF5"
 
 
-@pytest.mark.parametrize(
-    "make", [_npy, _npy_single, _csv, _csv_with_header, _hdf5, _hdf5_in_a_group]
-)
+@pytest.mark.parametrize("make", [_npy, _npy_single, _hdf5, _hdf5_in_a_group])
 def test_every_format_gives_the_same_numbers(tmp_path, make):
     found = read_contacts(make(tmp_path))
     np.testing.assert_allclose(found["grasps"], NUMBERS, atol=1e-6)
@@ -61,11 +44,9 @@ def test_every_format_gives_the_same_numbers(tmp_path, make):
     assert (found["rows"] is not None) == (make is _hdf5_in_a_group)
 
 
-def test_one_grasp_may_be_a_vector_or_a_line(tmp_path):
+def test_one_grasp_may_be_a_vector(tmp_path):
     np.save(tmp_path / "one.npy", NUMBERS[0])
-    (tmp_path / "one.csv").write_text(",".join(map(str, NUMBERS[0])))
-    for name in ("one.npy", "one.csv"):
-        assert np.array_equal(read_contacts(tmp_path / name)["grasps"], NUMBERS[:1])
+    assert np.array_equal(read_contacts(tmp_path / "one.npy")["grasps"], NUMBERS[:1])
 
 
 @pytest.fixture
@@ -157,7 +138,7 @@ def _absurd(path):
     [
         (_missing, r"grasps\.npy: must be a file of grasps, got none"),
         (_folder, r"grasps\.h5: must be a file of grasps, got none"),
-        (_other_suffix, r"must be a file \.npy, \.h5, \.hdf5, \.csv or \.parquet, got '\.txt'"),
+        (_other_suffix, r"must be a file \.npy, \.h5 or \.hdf5, got '\.txt'"),
         (_of("a.npy", b""), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_of("a.npy", b"PK\x03\x04 zip"), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_cut_off, "must be a .npy file of numbers, got none"),
@@ -169,13 +150,6 @@ def _absurd(path):
         (_array(np.zeros((2, 3, 6))), r"or one grasp, got an array of shape \(2, 3, 6\)"),
         (_array(1.0), r"or one grasp, got an array of shape \(\)"),
         (_array(np.zeros((0, 18))), "must hold at least one grasp, got none"),
-        (_of("a.csv", b"1,2\n1,two\n"), "of equally many numbers, got none .*'two'"),
-        (_of("a.csv", b"1,two\n1,2\n"), "of equally many numbers, got none .*'two'"),
-        (_of("a.csv", b"\n1;2\n3;4\n"), "of equally many numbers, got none .*'1;2'"),
-        (_of("a.csv", b"a,b\n1,2\n1,2,3\n"), "of equally many numbers, got none .*2 to 3"),
-        (_of("a.csv", b"1,2,\n"), "of equally many numbers, got none .*''"),
-        (_of("a.csv", b"a,b\n\n"), "must hold at least one grasp, got none"),
-        (_of("a.csv", b"\xff\xfe1\x00"), "of equally many numbers, got none"),
         (_of("a.h5", b"no HDF5"), "must be a file of grasps, .* by the name 'grasps', got none"),
         (_tree(images=np.zeros(3)), "must hold an array 'grasps' .*, got none$"),
         (_tree(grasps=["a"]), "/grasps: must hold real numbers"),

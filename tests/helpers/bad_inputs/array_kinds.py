@@ -102,20 +102,6 @@ CAMERA_NPY: tuple[Kind, ...] = (
 )
 
 
-LINE = ",".join(map(str, GRASP))
-PREDICTIONS_CSV: tuple[Kind, ...] = (
-    *ANY_FILE,
-    whole_file("only a header", ",".join("abc") + "\n"),
-    whole_file("17 numbers", ",".join(map(str, GRASP[:17]))),
-    whole_file("blanks", LINE.replace(",", " ")),
-    whole_file("quotes", LINE.replace("0.03", '"0.03"', 1)),
-    whole_file("a null byte", LINE.replace("0.03", "\x00", 1)),
-    whole_file("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{LINE}"),
-    whole_file("commas", "," * 17),
-    whole_file("steering", LINE.replace("0.03", "\x1b]0;x\x07", 1)),
-)
-
-
 def _predictions_hdf5(name: str, edit: Callable[[h5py.File], object]) -> Kind:
     def spoil(path: Path) -> None:
         with h5py.File(path, "w") as file:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from helpers.bad_inputs.json_kinds import table, twice, value_kind
-from helpers.bad_inputs.kinds import ANY_TEXT, Kind, whole_file
+from helpers.bad_inputs.kinds import ANY_TEXT, Kind
 
 _OBJECT = {
     "name": "name",
@@ -105,14 +105,4 @@ DECISIONS: tuple[Kind, ...] = (
     ),
     value_kind(("version",), "of the future", "2"),
     twice(("rejected",)),
-)
-
-
-#: A text of trial ids; 0 is a success, 1 is none.
-REJECTED_IDS: tuple[Kind, ...] = tuple(
-    whole_file(f"the line {text[:20]!r}", b"3\n" + text + b"\n")
-    for text in (
-        *(b"-1", b"1", b"1.5", b"nan", b"x", b"0 3", b"0,3", b"99999999", b"9" * 5000),
-        *(b"\xff\xfe", b"\x00", "²".encode(), "٣".encode()),
-    )
 )

@@ -1,25 +1,30 @@
-"""The columns of successes: what filters and splits need of each grasp that held.
+"""Successes: what filters and splits need of each grasp that held, and why it is no sample.
 
 Input: rows of `/trials` and `/looks`. Output: a table with the identity of each attempt, columns of
-its rows, and the columns below, each of which one function derives. A column whose sources are
-missing is left out.
+its rows, and the columns below, each of which one function derives; a column whose sources are
+missing is left out. From it follows the `Removal` of each: by the rules of `filters`, user-defined
+filters, outliers and rejections.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
+from drakegrasp import registry
 from drakegrasp.arithmetic import multiply
-from drakegrasp.config import CameraConfig
+from drakegrasp.config import CameraConfig, Config, FilterConfig, is_own_class
 from drakegrasp.dataset import quality
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import CAMERAS, with_derived
-from drakegrasp.filters import NEEDED, Flags
+from drakegrasp.errors import ConfigError, listed
+from drakegrasp.filters import NEEDED, Flags, Removal, Rule, first_removal, is_outlier
 from drakegrasp.frames import Array, invert_pose, unpack_pose
 from drakegrasp.grasp import unused_fingers
+from drakegrasp.registry import own_class, run_own
 from drakegrasp.table import Table
 from drakegrasp.vision.camera import intrinsics, project
 
@@ -200,19 +205,127 @@ TRIAL_COLUMNS = tuple(
 )
 
 
-def successes_of(rows: Mapping[str, AnyArray], camera: CameraConfig, *, object: int = 0) -> Table:
-    """Return what filters and splits need of n successes; `trial_id` counts from 0.
+def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
+    """Return what filters and splits need of n successes of a work unit.
+
+    `trial_id` is the row in the unit's /trials, `object` is 0, and `by_rule` is the reason of the
+    first rule that rejects the success: it is judged once, here.
 
     Args:
         rows: Columns of the successes' rows of `/trials` and `/looks`, by their names there;
             `depth_otm` (n, S, S) are their otm depth images [m].
-        camera: Camera that sees the grasps.
-        object: Row of the successes' object in /objects.
+        config: Configuration, whose camera and limits of filters are used.
     """
     t = Table(with_derived(rows))
-    derived = {n: d.of(t, camera) for n, d in DERIVED.items() if t.has(*d.needs)}
-    return t.only(*COPIED).with_columns(
-        derived,
-        trial_id=np.arange(t.count, dtype=np.int64),
-        object=np.full(t.count, object, dtype=np.int32),
-    )
+    derived = {n: d.of(t, config.camera) for n, d in DERIVED.items() if t.has(*d.needs)}
+    successes = t.only(*COPIED).with_columns(derived, object=np.zeros(t.count, dtype=np.int32))
+    if t.has("row"):
+        successes = successes.with_columns(trial_id=t["row"].astype(np.int64))
+    return successes.with_columns(by_rule=first_removal(successes, config.filters))
+
+
+# Removals
+
+#: The setting that names user-defined filters.
+_OWN = "filters.own"
+#: A filter: returns which successes it keeps, (n,) of bool if it is correct.
+_Keep: TypeAlias = Callable[[Table], Any]
+
+
+def judge_successes(
+    successes: Table,
+    config: FilterConfig,
+    rejected: Sequence[int] = (),
+) -> npt.NDArray[np.uint8]:
+    """Return the `Removal` (n,) of each success.
+
+    Args:
+        successes: The n successes, with the columns of `successes_of`.
+        config: Limits of the filters.
+        rejected: Ids of trials that an inspection rejects.
+
+    Raises:
+        ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
+    """
+    # Filters that judge each grasp by itself.
+    removal = successes["by_rule"].copy()
+    own = _removed_by_own(config, successes)
+    removal[own & (removal == Removal.KEPT)] = Removal.OWN
+
+    # Outliers among the remaining grasps of an object that use the same fingers.
+    kept = removal == Removal.KEPT
+    if config.outlier_sigma > 0.0:
+        groups = np.column_stack([successes["object"], successes["unused"]])
+        for group in np.unique(groups[kept], axis=0):
+            rows = np.flatnonzero(kept & (groups == group).all(axis=1))
+            outside = is_outlier(successes["grasp_T"][rows], config.outlier_sigma)
+            removal[rows[outside]] = Removal.OUTLIER
+
+    # The inspection comes last, since it only saw samples.
+    listed = np.isin(successes["trial_id"], np.asarray(rejected, dtype=np.int64))
+    removal[listed & (removal == Removal.KEPT)] = Removal.REJECTED
+    return removal
+
+
+def own_filters(config: FilterConfig) -> list[_Keep]:
+    """Return the filters that the configuration names: classes in files, or rules of packages.
+
+    Raises:
+        ConfigError: If a filter cannot be imported, or is not a filter.
+    """
+    return [_own_filter(name, config) for name in config.own]
+
+
+def _own_filter(name: str, config: FilterConfig) -> _Keep:
+    if is_own_class(name):
+        found = own_class(name, config.code, key=_OWN, method="keep", takes=("successes",))
+        return lambda successes: found().keep(successes)
+    rule = registry.find("rules", name)
+    if not isinstance(rule, Rule):
+        raise ConfigError(f"rules: {name} must be a Rule, got {type(rule).__name__}")
+
+    def keep(successes: Table) -> Flags:
+        if missing := [column for column in rule.needs if not successes.has(column)]:
+            columns = listed(sorted(successes.names))
+            raise ConfigError(f"{name}: needs must be some of {columns}, got {listed(missing)}")
+        return np.asarray(~rule.refuses(successes, config))
+
+    return keep
+
+
+def own_setting(config: FilterConfig) -> str:
+    """Return the setting `KEY=VALUE` that names the user-defined filters; empty if there are none.
+
+    A dataset stores the names of their files without folders.
+    """
+    names = [name.partition("@")[0] for name in config.own]
+    value = names[0] if len(names) == 1 else f"[{', '.join(names)}]"
+    return f"{_OWN}={value}" if names else ""
+
+
+def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
+    """Return which successes (n,) are removed by a user-defined filter."""
+    due = (successes.count,)
+    removed = np.zeros(due, dtype=np.bool_)
+    if due == (0,):
+        return removed
+    for name, keep in zip(config.own, own_filters(config), strict=True):
+        kept = np.asarray(run_own(name, keep, successes))
+        if kept.dtype != np.bool_ or kept.shape != due:
+            raise ConfigError(
+                f"{name.partition('@')[0]}: keep must return {due} of bool, "
+                f"got {kept.shape} of {kept.dtype}"
+            )
+        removed |= ~kept
+    return removed
+
+
+def find_hits(successes: Table, config: Config) -> tuple[tuple[int, int], ...]:
+    """Return the candidates and stand-offs of the successes that count for a target.
+
+    They pass all filters except the one of outliers, which needs all grasps of an object.
+    """
+    filters = config.filters.model_copy(update={"outlier_sigma": 0.0})
+    successes = successes[judge_successes(successes, filters) == Removal.KEPT]
+    names = ("candidate", "standoff_index")
+    return tuple(zip(*(successes[name].tolist() for name in names), strict=True))

@@ -17,14 +17,13 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.assembly.removal import judge_successes
-from drakegrasp.dataset.assembly.split import Home, find_homes, split_samples
-from drakegrasp.dataset.assembly.successes import LOOK_COLUMNS, TRIAL_COLUMNS, successes_of
-from drakegrasp.dataset.hdf5 import AnyArray, read_columns
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, sizes_in
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.dataset.schema import LOOK_FIELDS, SUCCESS_FIELDS, TRIAL_FIELDS, sizes
+from drakegrasp.dataset.schema import LOOK_FIELDS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ShardHeader, open_shard
+from drakegrasp.dataset.split import Home, find_homes, split_samples
+from drakegrasp.dataset.successes import LOOK_COLUMNS, TRIAL_COLUMNS, judge_successes, successes_of
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.runtime.files import read_seal
@@ -84,7 +83,7 @@ def survey(
     Args:
         out: Directory of the dataset.
         manifest: Its manifest.
-        known: The successes of each shard, as `successes_by_rule` returns them; None: they are read
+        known: The successes of each shard, as `successes_of` returns them; None: they are read
             from the shards.
         progress: Called with the number of surveyed shards and the number of all.
 
@@ -96,23 +95,18 @@ def survey(
     shards, tables, first = list[ShardRows](), list[Table](), 0
     for header in headers:
         i = numbers[header.object_name]
-        with open_shard(header.path(out), header) as (file, _):
+        with open_shard(header.path(out), header) as file:
             # The rows end with the last palm pose that the dataset takes. So a dataset does not
             # depend on how many more attempts the workers had begun.
             palms, tried = file["trials/candidate"][:], manifest.objects[i].tried
             count = len(palms) if tried is None else int(np.count_nonzero(palms < tried))
             if known is None:
-                rows = shard_successes(file)
-                successes = successes_of(rows, manifest.config.camera)
-                successes = successes.with_columns(trial_id=rows["row"].astype(np.int64))
+                successes = successes_of(shard_successes(file), manifest.config)
             else:
                 successes = known[header]
             if not letters:
-                letters = sizes(
-                    fingers=file["trials/closed_touching"].shape[1],
-                    joints=file["trials/closed_q"].shape[1],
-                    image=file["looks/image_otm"].shape[-1],
-                )
+                letters = sizes_in(file["trials"], TRIAL_FIELDS)
+                letters |= sizes_in(file["looks"], LOOK_FIELDS)
         successes = successes[successes["trial_id"] < count]
         own = np.full(successes.count, i, dtype=np.int32)
         ids = first + successes["trial_id"]
@@ -185,11 +179,6 @@ class Decisions:
         return {
             split: self.survey.successes["trial_id"][rows] for split, rows in self.splits.items()
         }
-
-    def columns(self) -> dict[str, AnyArray]:
-        """Return the columns of /successes: why each success is, or is not, a sample."""
-        own = self.survey.successes.only(*(f.name for f in SUCCESS_FIELDS))
-        return {"removal": self.removal, **own}
 
 
 def keys_of(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:

@@ -1,1 +1,0 @@
-"""Assembling in tasks: surveying shards, packing rows, writing samples."""
