@@ -122,13 +122,13 @@ def _refuse_place(out: Path, source: Path) -> None:
         DataError: If it cannot be written.
     """
     from drakegrasp.exchange.attempts import holds_postures
-    from drakegrasp.verification.result_files import refuse_unwritable_files
+    from drakegrasp.verification.result_files import refuse_unwritable
 
     if out.suffix.lower() not in HDF5:
         raise UsageError(f"--out must be a file {' or '.join(HDF5)}, got {str(out)!r}")
     if out.exists() and out.samefile(source):
         raise UsageError(f"--out must be another file than INPUT, got {str(out)!r}")
-    refuse_unwritable_files(out)
+    refuse_unwritable(out)
     try:
         known = not out.exists() or holds_postures(out)
     except GraspError:  # no HDF5 file

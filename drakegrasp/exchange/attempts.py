@@ -53,8 +53,7 @@ from drakegrasp.simulation.attempts import (
     xyzw_poses,
 )
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.verification.placing import choose_rows, read_several
-from drakegrasp.verification.prediction import ContactRows, read_grasps
+from drakegrasp.verification.prediction import ContactRows, choose_rows, read_grasps, read_several
 
 #: Values that a file states once for all its rows.
 _OF_FILE = ("frame", "link", "joints", "hand", "gripper", "of_objects")

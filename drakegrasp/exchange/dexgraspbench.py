@@ -354,7 +354,7 @@ def fitted_postures(
 
     For contacts it is the posture of the first wrist pose that fits them.
     """
-    contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.method != "posture"]
+    contacts = [(i, g) for i, g in enumerate(grasps) if not (g.invalid or g.postures)]
     fitted = dict(execute(_fit, contacts))
 
     def posture_of(i: int, grasp: PlacedGrasp) -> Posture | str:

@@ -7,16 +7,21 @@ grasps at all is an error, with a message of one line.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import LARGEST
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import FARTHEST, Array, Frame, as_numbers, without_torch
-from drakegrasp.simulation.attempts import GraspRows
+from drakegrasp.simulation.attempts import GraspRows, read_confidence
+
+#: The row of a split for each of n grasps, or one row for all; None for all rows, in order.
+RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
 
 #: Frames of predicted contacts.
 FRAMES = (Frame.OBJECT, Frame.CAMERA, Frame.TABLE, Frame.MESH)
@@ -133,3 +138,77 @@ def _shape(row: Any) -> tuple[int, ...] | None:
         return as_numbers(row, "").shape
     except GraspError:
         return None
+
+
+def choose_rows(
+    dataset: GraspDataset,
+    rows: RowChoice,
+    count: int,
+    *,
+    said: str = "`rows` says for which rows they are",
+) -> npt.NDArray[np.int64]:
+    """Return the row (n,) of the dataset's split for each of `count` grasps; one may be for all.
+
+    `said` is the part of the error message that explains how to give rows.
+
+    Raises:
+        GraspError: If there is not exactly one row per grasp, or a row does not exist.
+    """
+    chosen = np.arange(count) if rows is None else np.asarray(rows)
+    # NumPy treats an empty list as real numbers.
+    if chosen.size and chosen.dtype.kind not in "iu":
+        raise GraspError(f"rows must be whole numbers, got values of type {chosen.dtype}")
+    chosen = chosen.astype(np.int64)
+    chosen = np.full(count, chosen) if chosen.ndim == 0 else chosen.ravel()
+
+    # Check that there is one row per grasp.
+    if len(chosen) != count:
+        raise GraspError(f"rows must be one per grasp ({count}), got {len(chosen)}")
+    if not len(dataset):
+        raise GraspError(f"{dataset.path}: {dataset.emptiness}")
+    if rows is None and count != len(dataset):
+        raise GraspError(
+            f"without rows there must be a grasp for each of the {len(dataset)} rows of "
+            f"{dataset.split} in {dataset.path.name}, got {count} grasps ({said})"
+        )
+
+    # Check that the rows exist.
+    wrong = chosen[(chosen < 0) | (chosen >= len(dataset))]
+    if len(wrong):
+        raise GraspError(
+            f"rows must be 0 to {len(dataset) - 1} of {dataset.split} in {dataset.path.name}, "
+            f"got {wrong[0]}"
+        )
+    return chosen
+
+
+def read_several(
+    grasps: npt.ArrayLike,
+    data: GraspDataset,
+    *,
+    fingers: int,
+    rows: RowChoice = None,
+    confidence: npt.ArrayLike | None = None,
+) -> ContactRows:
+    """Return predicted contacts for rows of a split; a row may have several predictions.
+
+    Args:
+        grasps: (n, 6k), or (n, m, 6k) with m grasps per row. NaN is kept: it is a bad prediction,
+            not a mistake of the caller.
+        data: The split.
+        fingers: Number of fingers, k.
+        rows: (n,), row that each prediction is for, with repeats; None for all rows in order.
+        confidence: (n,) or (n, m), greater is better.
+
+    Raises:
+        GraspError: If the shapes do not match, or a row does not exist.
+    """
+    array = as_numbers(grasps, "grasps must be numbers")
+    if array.ndim not in (2, 3) or array.size == 0:
+        raise GraspError(f"grasps must be (n, 6k), or (n, m, 6k) for m per row, got {array.shape}")
+    of_row = np.repeat(choose_rows(data, rows, len(array)), array[0, ..., 0].size)
+    stated = None
+    if confidence is not None:
+        stated = read_confidence(confidence, array.shape[:-1]).ravel()
+    flat = array.reshape(-1, array.shape[-1])
+    return read_grasps(flat, fingers, rows=of_row, confidence=stated)
