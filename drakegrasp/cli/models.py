@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -50,20 +51,29 @@ def audit(
         json_file: Write all findings as JSON.
         sheet: Write a picture of every object with its status (.png).
     """
-    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
     from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.objects.audit import audit as audit_meshes
+    from drakegrasp.objects.model import needed_limit
     from drakegrasp.runtime.files import atomic_path, write_atomic
 
     own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"] if hand else []).hand_source)
     limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
     with progress_bar("audit", "meshes") as progress:
         rows = audit_meshes(mesh_dir, units=units, manifest=manifest, **limits, progress=progress)
-    console = make_console()
-    console.print(audit_table(rows, compact=console.width < ROOMY))
-    say(audit_line(rows))
-    if line := memory_line(rows):
-        say(line)
+    for row in rows:
+        words = "; ".join([*row.notes, *(f"! {text}" for text in row.warnings)])
+        say(f"{row.status:<9} {row.name}{': ' * bool(words)}{words}")
+    counts = Counter(row.status for row in rows)
+    told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
+    warned = sum(bool(row.warnings) for row in rows)
+    say(f"{counted(len(rows), 'mesh', 'meshes')}: {told}; {warned} with a warning (!)")
+    known = [(row.preparing, row.name) for row in rows if row.preparing is not None]
+    if known:
+        most, name = max(known)
+        say(
+            f"preparing takes up to {most / 1e6:.0f} MB of a worker ({name}): --memory must be "
+            f"{needed_limit(most) / 1e6:.0f}MB or more"
+        )
 
     if json_file is not None:
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)

@@ -639,10 +639,6 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "Ferrari-Canny measure of the predicted contacts, 0 without force closure",
           of="epsilon",
           shown=Shown("epsilon of the requested contacts", digits=3)),
-    Field("smallest_friction", "", "float64", "-", "-",
-          "smallest friction coefficient at which forces within the hand's limits at the "
-          "predicted contacts hold the object; inf if there is none", of="smallest_friction",
-          shown=Shown("least friction at the requested contacts", digits=2)),
     *_measured(
         "pregrasp",
         Field("X_OG", "12", "float64", "m, -", "O", "fitted or given pose of the palm"),
@@ -662,8 +658,6 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("tries", "", "uint16", "-", "-", "number of wrist poses that were tried",
           of="num_tries",
           shown=Shown("wrist poses tried", digits=0)),
-    Field("closing_start", "k", "float64", "rad or m", "-",
-          "closing positions from which the simulated fingers close", of="closing_start"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,

@@ -23,13 +23,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
 from drakegrasp.hand.finger_sweep import pad_points
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import copy_materials
 from drakegrasp.simulation.contacts import (
     Contacts,
@@ -51,7 +49,6 @@ from drakegrasp.simulation.scene import (
     transfer_state,
 )
 from drakegrasp.simulation.screen import extra_margin
-from drakegrasp.simulation.settle import GRAVITY
 from drakegrasp.simulation.verdict import is_lost_sample
 
 #: An object that moved less than this in the hand since the last check is still held [m], [rad].
@@ -313,38 +310,6 @@ class LiftPath:
             shift * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
             shift * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
         )
-
-    def wrenches(self, model: ObjectModel) -> Array:
-        """Return the wrenches (2, 6) at the two peaks of acceleration, about Ocm in {O}.
-
-        Each is [torque; force] on the object [N m, N]. The orientation is constant, so there is no
-        torque, and every wrench of the motion lies between these two, which are
-
-            w = [0; m R_OW (g ẑ ± a_max)],   a_max = 10/√3 d / T².
-        """
-        shift = self.p_WO_end - self.X_WO[:3, 3]
-        peak = PEAK_ACCELERATION * shift / self.duration**2
-        forces_W = [carrying_force(model, peak), carrying_force(model, -peak)]
-        return np.hstack([np.zeros((2, 3)), forces_W @ self.R_WO])
-
-
-def carrying_force(model: ObjectModel, acceleration: npt.ArrayLike) -> Array:
-    """Return the force (3,) in {W} [N] that gives a free object an acceleration (3,) [m/s^2]."""
-    against_gravity = np.array([0.0, 0.0, GRAVITY])
-    return model.mass * (np.asarray(acceleration, dtype=float) + against_gravity)
-
-
-def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
-    """Return the path from a resting pose (4, 4) to p_TO = `lift.p_TG`.
-
-    Without a hand, the object's origin moves to the target of the palm.
-    """
-    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
-    p_WO_end = X_WT[:3, 3] + config.lift.p_TG
-    duration = lift_duration(float(np.linalg.norm(p_WO_end - X_WO[:3, 3])), config)
-    # The object may start at its target.
-    duration = max(duration, config.physics.time_step)
-    return LiftPath(X_WO=X_WO, p_WO_end=p_WO_end, duration=duration)
 
 
 def lift_duration(distance: float, config: Config) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from drakegrasp.config import LARGEST
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import FARTHEST, Array, Frame, as_numbers, without_torch
+from drakegrasp.frames import FARTHEST, Array, Frame, as_numbers
 from drakegrasp.simulation.attempts import GraspRows, read_confidence
 
 #: The row of a split for each of n grasps, or one row for all; None for all rows, in order.
@@ -62,8 +62,7 @@ def read_grasps(
     """Return the grasps of grasp vectors (n, 6k); a bad row does not affect other rows.
 
     Args:
-        grasps: (n, 6k), or (6k,) for one grasp: k points [m], then k outward normals. In a list of
-            rows, rows of another length and rows that are not numbers are invalid rows.
+        grasps: (n, 6k), or (6k,) for one grasp: k points [m], then k outward normals.
         fingers: Number of fingers, k.
         rows: (n,), row of a split that each grasp is for.
         confidence: (n,), greater is better.
@@ -73,7 +72,14 @@ def read_grasps(
     """
     # Each valid row has 6k numbers.
     size = 6 * fingers
-    array, invalid = _read_rows(grasps, size, fingers)
+    array = as_numbers(grasps, f"a grasp must be {size} numbers")
+    if array.ndim not in (1, 2) or array.shape[-1] != size:
+        raise GraspError(
+            f"a grasp must be {size} numbers ({fingers} points, then {fingers} outward normals), "
+            f"got an array of shape {array.shape}"
+        )
+    array = np.atleast_2d(array)
+    invalid = [""] * len(array)
 
     # Reject numbers that no contact has.
     limit = np.r_[np.full(size // 2, FARTHEST), np.full(size // 2, LARGEST)]
@@ -103,41 +109,6 @@ def read_grasps(
         normals=normals / length[..., None],
         normalised=np.abs(length - 1.0).max(axis=1, initial=0.0) > NORMAL_TOLERANCE,
     )
-
-
-def _read_rows(grasps: npt.ArrayLike, size: int, fingers: int) -> tuple[Array, list[str]]:
-    """Return rows (n, 6k), NaN for rows of another length, and the reasons."""
-    # Rows of different lengths come as a list, or as an array of objects.
-    rows = without_torch(grasps)
-    rows = rows if isinstance(rows, list) else np.asarray(rows)
-    if isinstance(rows, list) or (rows.dtype == object and rows.ndim == 1):
-        shapes = [_shape(row) for row in rows]
-        if len(set(shapes)) > 1 and any(shapes):
-            array, invalid = np.full((len(rows), size), np.nan), [""] * len(rows)
-            for i, (row, shape) in enumerate(zip(rows, shapes, strict=True)):
-                if shape == (size,):
-                    array[i] = as_numbers(row, f"a grasp must be {size} numbers")
-                else:
-                    numbers = 0 if shape is None else int(np.prod(shape))
-                    invalid[i] = f"the row has {numbers} numbers, not {size}"
-            return array, invalid
-
-    array = as_numbers(grasps, f"a grasp must be {size} numbers")
-    if array.ndim not in (1, 2) or array.shape[-1] != size:
-        raise GraspError(
-            f"a grasp must be {size} numbers ({fingers} points, then {fingers} outward normals), "
-            f"got an array of shape {array.shape}"
-        )
-    array = np.atleast_2d(array)
-    return array, [""] * len(array)
-
-
-def _shape(row: Any) -> tuple[int, ...] | None:
-    """Return the shape of a row of numbers, () for a single number; None for no numbers."""
-    try:
-        return as_numbers(row, "").shape
-    except GraspError:
-        return None
 
 
 def choose_rows(

@@ -1,8 +1,8 @@
 """The result of verifying one grasp: the verdict, what was simulated, and why, in sentences.
 
 Input: what `verify` measured. Output: a `Verification` and its explanation. The explanation states
-whether the grasp holds and why, what moved, how close the contacts are to the requested ones, and
-what forces at the contacts alone can do. If the points are off the object, this is reported first.
+whether the grasp holds and why, what moved, and how close the contacts are to the requested ones.
+If the points are off the object, this is reported first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from drakegrasp.config import Config
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.generation.attempts import unjudged
-from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed
@@ -29,7 +28,7 @@ from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.verification.hints import FAR, find_hints
-from drakegrasp.verification.margin import force_margin
+from drakegrasp.verification.margin import contact_epsilon
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.wrist_solver import WristFit
 
@@ -67,7 +66,7 @@ class PoseTrial:
 class Verification:
     """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
 
-    The grasp is judged by its first wrist pose, which fits the contacts best. Margins and hints are
+    The grasp is judged by its first wrist pose, which fits the contacts best. Epsilon and hints are
     computed when they are asked for.
 
     Attributes:
@@ -81,7 +80,7 @@ class Verification:
         seconds: Wall-clock time by stage [s].
         stand: Index of the resting pose of this verdict: the best of those in which a posture was
             tried.
-        margin: Epsilon and smallest friction, if they were computed already.
+        margin: Epsilon, if it was computed already.
         told: The hints, if they were found already.
     """
 
@@ -94,7 +93,7 @@ class Verification:
     tries: tuple[PoseTrial, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     stand: int = 0
-    margin: tuple[float, float] | None = None
+    margin: float | None = None
     told: tuple[str, ...] | None = None
 
     @property
@@ -180,14 +179,6 @@ class Verification:
         return self.first.pregrasp if self.first else None
 
     @property
-    def closing_start(self) -> Array | None:
-        """(k,), initial closing positions; NaN for fingers that a preshape leaves out."""
-        start = self.pregrasp
-        if start is None or start.closing is None:
-            return None
-        return for_all_fingers(start.closing, start.unused, len(self.p_OQ))
-
-    @property
     def trial(self) -> TrialRecord | None:
         """The first trial."""
         return self.first.trial if self.first else None
@@ -220,29 +211,17 @@ class Verification:
 
     # Margins and hints
 
-    @property
-    def epsilon(self) -> float:
-        """Ferrari-Canny measure of the contacts; 0 without force closure, NaN for a posture."""
-        return self._margin[0]
-
-    @property
-    def smallest_friction(self) -> float:
-        """Smallest friction coefficient at which forces hold the object at the contacts.
-
-        The forces are within the hand's limit; it is inf if no coefficient suffices.
-        """
-        return self._margin[1]
-
     @cached_property
     @one_thread
-    def _margin(self) -> tuple[float, float]:
+    def epsilon(self) -> float:
+        """Ferrari-Canny measure of the contacts; 0 without force closure, NaN for a posture."""
         if self.margin is not None:
             return self.margin
         if self.grasp.postures or self.grasp.invalid:
-            return np.nan, np.nan
+            return np.nan
         with timed(self.seconds, "margin"):
-            X_TO = self.placed.X_TO_simulated
-            return force_margin(self.placed.model, X_TO, self.p_OQ, self.nhat_Q_O, self.config)
+            about = self.placed.model, self.p_OQ, self.nhat_Q_O
+            return contact_epsilon(*about, self.config.physics)
 
     @property
     def misplaced(self) -> bool:
@@ -268,7 +247,7 @@ class Verification:
 
     def explained(self) -> Verification:
         """Return the verdict with margins and hints, which are computed now."""
-        return replace(self, margin=self._margin, told=self.hints)
+        return replace(self, margin=self.epsilon, told=self.hints)
 
     def findings(self) -> dict[str, Any]:
         """Return the attributes without the grasp, whose meshes are large."""
@@ -346,9 +325,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _as_a_sample(verified, verified.removal)
         yield from _loads(verified)
 
-    # What forces at the contacts alone can do, and other possible faults in the numbers.
-    if not np.isnan(verified.smallest_friction):
-        yield _margin(verified)
+    # Other possible faults in the numbers.
     if verified.hints:
         yield better
 
@@ -448,23 +425,6 @@ def _as_a_sample(verified: Verification, removal: Removal) -> str:
     verdict = "would be a sample" if kept else f"would be no sample ({removal.label})"
     rules = ", ".join(each.label for each in verified.unjudged)
     return f"In a dataset it {verdict}; not judged: {rules}."
-
-
-def _margin(verified: Verification) -> str:
-    """Return the friction that forces at the contacts alone need."""
-    physics = verified.placed.model.own_physics(verified.config.physics)
-    needed, simulated = verified.smallest_friction, physics.friction_hand
-    if np.isfinite(needed):
-        text = f"Forces at these points alone need a friction coefficient of {needed:.2f}"
-    else:
-        text = "Forces at these points alone are not enough at any friction"
-    text += f"; the simulation has {simulated:.2f}"
-    if verified.held and needed > simulated:
-        # A point does not resist twisting, but an area of contact does; and a grasp that slips is
-        # held at other points.
-        text += ", but the hand's contacts are areas"
-        text += "" if verified.stable else ", and the object is not held where they were"
-    return f"{text} (epsilon {verified.epsilon:.3f})."
 
 
 def in_mm(length: float) -> str:
