@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, Unpack
+from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,6 @@ from drakegrasp.verification.placing import (
     contacts_on_rows,
     dataset_config,
 )
-from drakegrasp.verification.prediction import RowChoice
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import ResultCallback, ignore_result, verify_batch
 
@@ -93,10 +92,15 @@ def verify_grasp(
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
 
-    placed, used = _place(
+    if (count := _count(grasp)) != 1:
+        raise GraspError(
+            f"one grasp must be a vector, got {count} grasps; many go into verify_grasps"
+        )
+    rows = None if row is None else [row]
+    (verdict,) = verify_grasps(
         grasp,
         on,
-        row,
+        rows=rows,
         frame=frame,
         X_TC=X_TC,
         units=units,
@@ -104,12 +108,15 @@ def verify_grasp(
         hand=hand,
         config=config,
     )
-    if len(placed) != 1:
-        raise GraspError(
-            f"one grasp must be a vector, got {len(placed)} grasps; many go into verify_grasps"
-        )
-    (verdict,) = run_verification(placed, used, show=False, explained=False)
     return verdict
+
+
+def _count(grasps: Any) -> int:
+    """Return the number of grasps; 1 for what is no array, which is refused when it is read."""
+    try:
+        return len(grasps) if np.ndim(grasps) > 1 else 1
+    except ValueError:
+        return 1
 
 
 def verify_grasps(
@@ -167,36 +174,7 @@ def verify_grasps(
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
-    placed, used = _place(
-        grasps,
-        on,
-        rows,
-        frame=frame,
-        X_TC=X_TC,
-        units=units,
-        X_TO=X_TO,
-        hand=hand,
-        config=config,
-    )
-    return run_verification(placed, used, client=client, show=show, explained=False)
-
-
-def _place(
-    grasps: npt.ArrayLike,
-    on: GraspTarget,
-    rows: RowChoice,
-    *,
-    frame: str | None,
-    X_TC: npt.ArrayLike | None,
-    units: str | None,
-    X_TO: npt.ArrayLike | None,
-    hand: str | Path | None,
-    config: Config | None,
-) -> tuple[list[PlacedGrasp], Config]:
-    """Return grasps on their target, and the configuration, as `run_verification` takes them.
-
-    Arguments and errors are those of `verify_grasps`.
-    """
+    placed: list[PlacedGrasp]
     if isinstance(on, Sample | GraspDataset):
         for name, value in {"X_TC": X_TC, "units": units, "X_TO": X_TO}.items():
             if value is not None:
@@ -205,12 +183,22 @@ def _place(
                 )
         if isinstance(on, Sample) and rows is not None:
             raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
-        data, rows = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
+        data, chosen = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
         used = dataset_config(data, config, hand)
         # A given configuration is used as it is; that of a dataset has the rows' draws.
         drawn, frame = config is None, frame or "camera"
-        return contacts_on_rows(grasps, data, rows, config=used, drawn=drawn, frame=frame), used
+        placed = contacts_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
+    else:
+        _refuse_other_targets(on)
+        if rows is not None:
+            raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
+        thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
+        placed = contacts_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC)
+        used = thing.config
+    return run_verification(placed, used, client=client, show=show, explained=False)
 
+
+def _refuse_other_targets(on: object) -> None:
     if not isinstance(on, str | Path | trimesh.Trimesh | Placed):
         raise GraspError(
             "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a Sample or a "
@@ -220,11 +208,6 @@ def _place(
         raise GraspError(
             f"on must be GraspDataset({str(on)!r}, split=...) for a data file, got its path"
         )
-    if rows is not None:
-        raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
-    thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
-    placed = contacts_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC)
-    return placed, thing.config
 
 
 def run_verification(

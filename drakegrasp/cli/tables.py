@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
@@ -17,9 +16,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.statistics import (
-    NO_NAME,
     Funnel,
-    PreshapeCount,
     SplitCount,
     Unfinished,
     count_funnel,
@@ -27,7 +24,6 @@ from drakegrasp.dataset.statistics import (
     count_unfinished,
     held_note,
     objects_without_samples,
-    preshapes_of,
     split_shortfall,
 )
 from drakegrasp.distinct import BANDS
@@ -112,56 +108,33 @@ def funnel_table(funnel: Funnel) -> Table:
     """
     shown = [o for o in _FUNNEL if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
-    heads = ["poses", "attempts", *map(_head, shown)]
+    heads = ["poses", "attempts", *map(_head, shown), "precision", "stable"]
     heads += [f"- {r.label}".replace("_", "\n") for r in removed] + ["samples", "distinct"]
 
     def row(objects: slice) -> list[str]:
         outcomes = funnel.outcomes[objects].sum(axis=0).tolist()
         cells = [funnel.candidates[objects].sum(), sum(outcomes)]
         cells += [outcomes[o] for o in shown]
+        cells += [funnel.precision[objects].sum(), funnel.stable[objects].sum()]
         cells += [funnel.removals[objects, r].sum() for r in removed]
         cells += [funnel.samples[objects].sum(), funnel.distinct[objects].sum()]
         return list(map(_count, cells))
 
-    caption = "distinct: samples whose palms are within 20 mm and 30° of each other count as one"
+    notes = [
+        "precision: successes that the fingertips alone hold; stable: precision, and the object "
+        "moved by less than 5 mm and 5° in the hand",
+        "distinct: samples whose palms are within 20 mm and 30° of each other count as one",
+        held_note(funnel),
+    ]
+    caption = "\n".join(filter(None, notes))
     return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
 
 
-def hold_table(funnel: Funnel) -> Table:
-    """Return how well the successes hold, with a row per object and a row for all objects."""
-    notes = [
-        "held: the outcome success; precision: held with the fingertips alone; stable: precision, "
-        "and the object moved by less than 5 mm and 5° in the hand"
-    ]
-    held, stable = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable
-    if note := held_note(funnel):
-        notes.append(note)
-
-    def row(objects: slice) -> list[str]:
-        counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
-        samples = _count(funnel.samples[objects].sum())
-        all_held, all_stable = int(held[objects].sum()), int(stable[objects].sum())
-        share = f"{all_stable / all_held:.0%}" if all_held else "-"
-        return [*(_count(count[objects].sum()) for count in counts), share, samples]
-
-    heads = ["attempts", "held", "precision", "stable", "stable\nof held", "samples"]
-    return _table_of_objects("How well the hand holds", heads, funnel, row, "\n".join(notes))
-
-
-def preshape_table(counts: Sequence[PreshapeCount]) -> Table:
-    """Return how the attempts of each preshape ended, with one row per preshape."""
-    heads = ("preshape", "attempts", "held", "stable", "samples")
-    rows = ([c.preshape, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
-    nameless = any(count.preshape == NO_NAME for count in counts)
-    caption = f"{NO_NAME}: postures for which all fingers close" if nameless else ""
-    return make_table("Preshapes", heads, rows, caption=caption)
-
-
-def split_table(counts: Sequence[SplitCount]) -> Table:
+def split_table(counts: Sequence[SplitCount], rule: str) -> Table:
     """Return the paper's Table III with an additional column of objects."""
     heads = ("split", "samples", "distinct", "objects", "classes")
     rows = ([c.split, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
-    return make_table("Samples by split", heads, rows)
+    return make_table(f"Samples by split (by {rule})", heads, rows)
 
 
 def approach_line(funnel: Funnel) -> str:
@@ -174,16 +147,6 @@ def approach_line(funnel: Funnel) -> str:
     bands = zip(BANDS, funnel.elevations.sum(axis=0).tolist(), strict=True)
     shares = ", ".join(f"{low}-{high}° {number / distinct:.0%}" for (low, high), number in bands)
     return f"{found} in {cells}; above the table they come from {shares}"
-
-
-def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
-    """Return a line with the rule of the split and the number of tested objects."""
-    objects = {count.split: count.objects for count in counts}
-    total = np.count_nonzero(funnel.samples)
-    # In a split by class, the objects for validation are those for training.
-    valid = f", {objects['valid']:,} valid" if rule == "object" else ""
-    some = counted(int(total), "object")
-    return f"split by {rule}: {some} with samples, {objects['test']:,} of them test{valid}"
 
 
 def barren_lines(funnel: Funnel, config: Config) -> list[str]:
@@ -239,16 +202,12 @@ def print_stats(out: Path) -> None:
     console, unfinished = make_console(), count_unfinished(out)
     funnel = count_funnel(out) if unfinished is None else unfinished.funnel
     console.print(funnel_table(funnel))
-    console.print(hold_table(funnel))
     manifest = read_manifest(out)
     config, rule = manifest.config, manifest.config.split.by
-    if preshapes := preshapes_of(funnel, config):
-        console.print(preshape_table(preshapes))
     console.print()
     if unfinished is None:
         splits = count_splits(out)
-        console.print(split_table(splits))
-        say(split_line(rule, funnel, splits))
+        console.print(split_table(splits, rule))
         if line := approach_line(funnel):
             say(line)
         for line in barren_lines(funnel, config):

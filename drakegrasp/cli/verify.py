@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 #: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
-#: Rows as text: numbers of at most seven digits, and ranges of them.
-ROWS = re.compile(r"\d{1,7}(-\d{1,7})?(,\s*\d{1,7}(-\d{1,7})?)*")
 
 
 @Parameter(name="*")
@@ -59,10 +57,6 @@ class Target:
         config: Configuration: a file, or the preset paper, fast, randomized or released. [default:
             that of the dataset, else the defaults]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
-        rows: With --dataset: for each grasp its row of the split, if the file does not specify it,
-            e.g. 0,4,7-9. [default: all rows]
-        camera: With --object and --frame camera: .npy file with the camera's pose in the table-top
-            frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).
         link: Frame or link of the poses in files of postures, which overrides the files: palm, the
             palm link, or a frame of another tool that the hand file names, e.g. graspgen.
         preshape: Preshape for rows of postures that name none; the value each, for palm poses
@@ -77,8 +71,6 @@ class Target:
     hand: Annotated[str | None, Parameter(metavar="NAME|YAML|XML")] = None
     config: Preset | None = None
     overrides: Settings = ()
-    rows: Annotated[str | None, Parameter(group=MORE, metavar="ROWS")] = None
-    camera: Annotated[AnyPath | None, Parameter(group=MORE, metavar="FILE")] = None
     link: Annotated[Name | None, Parameter(group=MORE)] = None
     preshape: Annotated[Name | None, Parameter(group=MORE)] = None
 
@@ -200,10 +192,6 @@ def _write_line(line: str) -> None:
 
 def _say_counts(results: Sequence[Verification]) -> None:
     """Print how many grasps have each outcome and verdict, and what would fit much better."""
-    from collections import Counter
-
-    from drakegrasp.verification.hints import count_hints
-
     total = f"of {counted(len(results), 'grasp')}"
     for outcome, count in Counter(result.outcome.label for result in results).most_common():
         say(f"{count:,} {total}: {outcome}", err=True)
@@ -212,7 +200,7 @@ def _say_counts(results: Sequence[Verification]) -> None:
     say(f"verdicts: {', '.join(counts)}", err=True)
     if best := [result.held for result in results if result.grasp.rank == 0]:
         say(f"{sum(best)} of {len(best)} best-ranked grasps hold", err=True)
-    for hint, count in count_hints(result.hints for result in results):
+    for hint, count in Counter(hint for each in results for hint in each.hints).most_common():
         say(f"{count} {total} would fit much better: {hint}", err=True)
     if lost := sum(result.misplaced and not result.hints for result in results):
         say(f"{lost} {total} are far from the object in every known frame and unit", err=True)
@@ -226,7 +214,7 @@ def _by_protocol(
     from drakegrasp.protocols.postures import json_line
 
     where, held = f"with protocol {protocol}", list[bool]()
-    target.refuse(where, "rows", "config", "overrides", "link", "preshape")
+    target.refuse(where, "config", "overrides", "link", "preshape")
     files = _bench_files(path, target, where, assets)
 
     def deliver(index: int, result: PostureResult, trials: PostureTrials) -> None:
@@ -260,7 +248,7 @@ def _bench_files(path: Path, target: Target, where: str, assets: Path | None) ->
             return []
     if not files:
         raise GraspError(f"{path}: must be a .npy file or a folder of them, got none")
-    names = ("mesh", "units", "dataset", "split", "frame", "camera")
+    names = ("mesh", "units", "dataset", "split", "frame")
     target.refuse(f"{where} and files of DexGraspBench", *names)
     if suffix != ".xml":
         must = "--hand must be an MJCF (.xml) with files of DexGraspBench"
@@ -304,7 +292,6 @@ def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
         GraspError: If no grasp belongs to the object, or the grasps are for rows of a dataset.
     """
     from drakegrasp.exchange.attempts import read_attempts
-    from drakegrasp.exchange.columns import read_numbers
     from drakegrasp.objects.sources import find_mesh
     from drakegrasp.simulation.attempts import Attempts
     from drakegrasp.verification.postures import place_on_object
@@ -323,7 +310,6 @@ def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
         named = table.objects
     else:
         how["frame"] = target.frame or "object"
-        how["X_TC"] = None if target.camera is None else read_numbers(target.camera)
         named = (name,) * len(table)
     placed = dg.place_object(target.mesh, units=target.units, config=config)
     ranked = _ranked(table, named)
@@ -381,11 +367,9 @@ def _of_rows(
     overrides = () if own else target.overrides
     config = dataset_config(data, own, target.hand, overrides)
     table = read_attempts(path, dg.load_hand(config.hand_source), of=data, read_as=target.read_as)
-    if table.of_row is not None:
-        target.refuse("with a file that has rows", "rows")
-    rows = table.of_row if target.rows is None else _read_rows(target.rows)
-    said = "`rows` in the file, or --rows, says for which rows they are"
-    rows = choose_rows(data, rows, len(table), said=said)
+    rows = choose_rows(
+        data, table.of_row, len(table), said="`rows` in the file says for which rows they are"
+    )
     _say_all(table.bare if isinstance(table, Attempts) else "", table.left_out)
     placed = place_on_rows(
         _ranked(table, rows),
@@ -425,32 +409,22 @@ def _dataset_of(path: Path, target: Target, postures: bool) -> Path | None:
             must = "--frame must be camera for a dataset's own grasps"
             raise GraspError(f"{must}, got {target.frame}")
 
-    # The camera of a posture is that of its row, and postures need no fit.
-    framed = target.mesh is not None and target.frame == "camera"
+    # The camera of a posture is that of its row.
     others = "" if postures else ", or grasps in an HDF5 file"
     for unused, where, *names in (
-        (postures, "with postures", "camera", "rows"),
         (postures and target.frame == "camera", "with postures", "frame"),
         (postures and target.dataset, "with postures and --dataset", "units", "hand", "config"),
         (not postures, "without postures", "link", "preshape"),
         (target.mesh is None, "without --object", "units"),
-        (target.dataset is None, "without --dataset", "rows"),
         (target.dataset is None and not stored, f"without --dataset{others}", "split"),
-        (not framed, "without --object and --frame camera", "camera"),
     ):
         if unused:
             target.refuse(where, *names)
-    if framed and target.camera is None:
-        raise GraspError("--camera FILE must be given with --object and --frame camera, got none")
+    if target.mesh is not None and target.frame == "camera":
+        raise GraspError(
+            "--frame must not be camera with --object, got camera: its pose is unknown"
+        )
     return None if target.mesh is not None else target.dataset or path
-
-
-def _read_rows(text: str) -> list[int]:
-    """Return the rows that a text names; ranges include both ends."""
-    if not ROWS.fullmatch(text):
-        raise GraspError(f"--rows must be as 0,4,7-9, got {text[:40]!r}")
-    ends = [part.partition("-") for part in text.split(",")]
-    return [row for first, _, last in ends for row in range(int(first), int(last or first) + 1)]
 
 
 def _say_all(*texts: str) -> None:

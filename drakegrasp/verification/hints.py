@@ -7,8 +7,6 @@ or with the fingers in a different order. All factors are own choices.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable
 from itertools import permutations
 
 import numpy as np
@@ -110,11 +108,6 @@ def find_hints(grasp: PlacedGrasp, nhat_Q_O: Array, *, fits: bool) -> tuple[str,
         fingers = " ".join(str(i + 1) for i in order)
         hints.append(f"contacts in the order {fingers} of the fingers")
     return tuple(hints)
-
-
-def count_hints(hints: Iterable[tuple[str, ...]]) -> list[tuple[str, int]]:
-    """Return the hints of many grasps with their counts, the most frequent first."""
-    return Counter(hint for each in hints for hint in each).most_common()
 
 
 def _better_place(grasp: PlacedGrasp, given: Table) -> str:

@@ -10,10 +10,9 @@ is on the face whose normal is closest to the predicted one. A point on the wron
 wall is therefore moved to the side that its normal names. If no such face is within `MAX_DISTANCE`,
 the contact is on the closest face of all.
 
-A fingertip touches at points with Coulomb friction. It pushes along the inward normal and along the
-surface; it neither pulls nor twists. It has one point, or for a hand with two fingertips several
-points that form a patch. The points of a patch share the finger's force in any way, so together
-they also resist twisting, which two points do not.
+A fingertip touches at a point with Coulomb friction. It pushes along the inward normal and along
+the surface; it neither pulls nor twists. So two fingertips have no force closure: they resist no
+torque about the line between them.
 """
 
 from __future__ import annotations
@@ -27,19 +26,6 @@ from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel
 
-#: Usual area of a fingertip's contact [m^2]: the median of 498 patches of the Barrett Hand
-#: after closing, on five G3DB meshes; half of them are between 57 and 89 mm^2.
-PATCH_AREA = 68e-6
-#: Radius of a disc of this area [m], 4.65 mm, and its torsion radius r under even pressure, 3.1 mm.
-#: A normal force f resists a torsional moment of mu f r (R. Howe, M. Cutkosky, "Practical
-#: force-motion models for sliding manipulation", IJRR 15(6), 1996).
-PATCH_RADIUS = float(np.sqrt(PATCH_AREA / np.pi))
-TORSION_RADIUS = 2.0 / 3.0 * PATCH_RADIUS
-#: Number of points on the ring of a patch.
-RING_POINTS = 8
-#: Hands with at least this many fingers are judged by points alone. With fewer fingers, points
-#: resist no torque about the line between them, so their contacts are patches.
-ENOUGH_POINTS = 3
 #: A prediction is off the surface if its point is farther from the surface than this [m], about the
 #: radius of a patch, or if its normal differs from the surface normal by more than this [rad].
 MAX_DISTANCE, MAX_ANGLE = 0.005, np.deg2rad(45.0)
@@ -69,8 +55,6 @@ def contact_epsilon(
         physics: The friction, unless the object has its own.
     """
     points, normals = surface_contacts(model, p_OQ, nhat_Q_O)
-    if len(points) < ENOUGH_POINTS:
-        points, normals = patch_points(model, points, normals)
     return ferrari_canny(
         points - model.p_OOcm,
         normals,
@@ -105,41 +89,6 @@ def surface_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> tuple[
     found = agreeing.min(axis=1) <= MAX_DISTANCE
     chosen = _nearest(np.where(found[:, None], agreeing, distance), cosine)
     return feet[np.arange(len(p_OQ)), chosen], np.asarray(model.collision.face_normals[chosen])
-
-
-def patch_points(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
-    """Return points (k, m, 3) [m] of the patches around k contacts, and normals (k, m, 3) there.
-
-    A patch consists of the contact and `RING_POINTS` points in a ring around it; each point has the
-    normal of the face on which it lies. The ring consists of the surface points that are closest to
-    a circle with the radius `TORSION_RADIUS` in the contact's tangent plane. Of equally close
-    faces, the one that is most parallel to the contact's face is used. So a patch ends at an edge
-    of 90 degrees or more, and bends around a blunter edge.
-
-    Args:
-        model: The object.
-        p_OQ: (k, 3), contacts on its surface in {O} [m].
-        nhat_Q_O: (k, 3), outward normals of the faces there.
-    """
-    # A circle about each contact.
-    angles = 2.0 * np.pi * np.arange(RING_POINTS) / RING_POINTS
-    ring = np.column_stack([np.zeros(RING_POINTS), np.cos(angles), np.sin(angles)])
-    circles = p_OQ[:, None] + TORSION_RADIUS * ring @ contact_axes(nhat_Q_O).transpose(0, 2, 1)
-
-    # A point of the circle is at most a radius from the surface, so at most two from the contact.
-    triangles, face_normals = model.collision.triangles, model.collision.face_normals
-    arms = surface_feet(triangles, p_OQ) - p_OQ[:, None]
-    near = np.linalg.norm(arms, axis=2) <= 2.0 * TORSION_RADIUS + SAME_DISTANCE
-    points, normals = [], []
-    for i, circle in enumerate(circles):
-        faces = np.flatnonzero(near[i])
-        cosine = face_normals @ nhat_Q_O[i]
-        feet = surface_feet(triangles[faces], circle)
-        distance = np.linalg.norm(feet - circle[:, None], axis=2)
-        chosen = _nearest(distance, np.broadcast_to(cosine[faces], distance.shape))
-        points.append(np.vstack([p_OQ[i], feet[np.arange(RING_POINTS), chosen]]))
-        normals.append(np.vstack([nhat_Q_O[i], face_normals[faces[chosen]]]))
-    return np.array(points), np.array(normals)
 
 
 def _nearest(distance: Array, cosine: Array) -> npt.NDArray[np.int64]:
