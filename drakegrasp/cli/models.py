@@ -33,7 +33,6 @@ def audit(
     manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
     hand: Annotated[str | None, Parameter(metavar="NAME|YAML")] = None,
     json_file: Annotated[NewFile | None, Parameter(name="--json")] = None,
-    sheet: NewFile | None = None,
 ) -> None:
     """Check which meshes are fit, repaired or refused.
 
@@ -49,12 +48,10 @@ def audit(
         hand: Hand whose opening and stand-offs are compared with the objects' sizes. [default:
             barrett]
         json_file: Write all findings as JSON.
-        sheet: Write a picture of every object with its status (.png).
     """
     from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.objects.audit import audit as audit_meshes
-    from drakegrasp.objects.model import needed_limit
-    from drakegrasp.runtime.files import atomic_path, write_atomic
+    from drakegrasp.runtime.files import write_atomic
 
     own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"] if hand else []).hand_source)
     limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
@@ -67,22 +64,9 @@ def audit(
     told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
     warned = sum(bool(row.warnings) for row in rows)
     say(f"{counted(len(rows), 'mesh', 'meshes')}: {told}; {warned} with a warning (!)")
-    known = [(row.preparing, row.name) for row in rows if row.preparing is not None]
-    if known:
-        most, name = max(known)
-        say(
-            f"preparing takes up to {most / 1e6:.0f} MB of a worker ({name}): --memory must be "
-            f"{needed_limit(most) / 1e6:.0f}MB or more"
-        )
-
     if json_file is not None:
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)
         write_atomic(json_file, f"{text}\n".encode())
-    if sheet is not None:
-        from drakegrasp.pictures.rendered import object_sheet
-
-        with progress_bar("draw", "objects") as progress, atomic_path(sheet) as png:
-            object_sheet(rows, png, progress=progress)
     if all(row.status == "refused" for row in rows):
         sys.exit(1)
 

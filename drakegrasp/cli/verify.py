@@ -306,7 +306,6 @@ def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
     how: dict[str, Any] = {}
     if isinstance(table, Attempts):
         table = _of_object(table, name, path)
-        _say_all(table.nameless, table.bare)
         named = table.objects
     else:
         how["frame"] = target.frame or "object"
@@ -341,7 +340,6 @@ def _of_objects(path: Path, target: Target, dataset: Path) -> tuple[list[PlacedG
     out = dataset.parent if dataset.is_file() else dataset
     config = override_config(read_manifest(out).config, target.overrides)
     table = read_attempts(path, dg.load_hand(config.hand_source), read_as=target.read_as)
-    _say_all(table.nameless, table.bare)
     own = config if target.overrides else None
     table = _ranked(table, table.objects)
     return place_on_dataset(table, out, own, overrides=target.overrides), config
@@ -353,7 +351,6 @@ def _of_rows(
     """Return the grasps of a file on the objects of rows of a dataset, and the rows."""
     from drakegrasp.dataset.reader import PredictedRows
     from drakegrasp.exchange.attempts import read_attempts
-    from drakegrasp.simulation.attempts import Attempts
     from drakegrasp.verification.placing import dataset_config
     from drakegrasp.verification.postures import place_on_rows
     from drakegrasp.verification.prediction import choose_rows
@@ -370,7 +367,8 @@ def _of_rows(
     rows = choose_rows(
         data, table.of_row, len(table), said="`rows` in the file says for which rows they are"
     )
-    _say_all(table.bare if isinstance(table, Attempts) else "", table.left_out)
+    if table.left_out:
+        say(table.left_out, err=True)
     placed = place_on_rows(
         _ranked(table, rows),
         data,
@@ -425,8 +423,3 @@ def _dataset_of(path: Path, target: Target, postures: bool) -> Path | None:
             "--frame must not be camera with --object, got camera: its pose is unknown"
         )
     return None if target.mesh is not None else target.dataset or path
-
-
-def _say_all(*texts: str) -> None:
-    for text in filter(None, texts):
-        say(text, err=True)

@@ -50,7 +50,6 @@ from drakegrasp.simulation.attempts import (
     quaternion_poses,
     read_confidence,
     taken,
-    xyzw_poses,
 )
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.verification.prediction import ContactRows, choose_rows, read_grasps, read_several
@@ -495,12 +494,11 @@ def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
     # The palm poses, in either form.
-    invalid = xyzw = None
+    invalid = None
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
     else:
-        place = arrays["position"], arrays["quaternion"]
-        (X_FG, invalid), xyzw = quaternion_poses(*place), xyzw_poses(*place)
+        X_FG, invalid = quaternion_poses(arrays["position"], arrays["quaternion"])
     numbers = {name: arrays[name] for name in _SCALARS if name in arrays}
     if "X_TO" in arrays:
         numbers["X_TO"] = _stacked(arrays["X_TO"], "X_TO")
@@ -509,7 +507,6 @@ def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "objects": texts["object"] if "object" in texts else [""] * len(X_FG),
         "X_FG": X_FG,
-        "X_FG_xyzw": xyzw,
         "link": _link(texts.get("link")),
         "frame": _only(texts.get("frame"), "frame") or "object",
         **{name: arrays[name] for name in stages if name in arrays},
@@ -608,8 +605,7 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> dict[st
         arrays[name] = np.array(told, dtype=object)
     raw = _of_arrays(arrays)
     reasons = [one or other for one, other in zip(invalid, raw["invalid"], strict=True)]
-    # The columns name the parts of quaternions, so their order is certain.
-    return {**raw, "alone": alone, "invalid": reasons, "X_FG_xyzw": None}
+    return {**raw, "alone": alone, "invalid": reasons}
 
 
 def _empty(columns: Mapping[str, list[Any]], names: Sequence[str]) -> npt.NDArray[np.bool_]:
