@@ -55,7 +55,7 @@ WALLS = {
     "starlette": ("page",),
     "uvicorn": ("page",),
     "jinja2": ("page",),
-    "matplotlib": ("pictures", "verification.figure"),
+    "matplotlib": ("pictures",),
     "pydrake": (*("hand", "vision", "simulation", "mjcf", "pictures", "verification"),),
     "mujoco": ("mjcf", "hand.draft.mujoco_model", "protocols.scene", "exchange.mjcf"),
     "coacd": ("mjcf.decomposition",),
@@ -65,7 +65,6 @@ WALLS = {
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {
     *((f"api.{module}", "distributed") for module in ("building", "scoring", "verifying")),
-    ("verification.result", "matplotlib"),
 }
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (
