@@ -56,7 +56,7 @@ WALLS = {
     "uvicorn": ("page",),
     "jinja2": ("page",),
     "matplotlib": ("pictures",),
-    "pydrake": (*("hand", "vision", "simulation", "mjcf", "pictures", "verification"),),
+    "pydrake": ("hand", "vision", "simulation", "mjcf", "pictures"),
     "mujoco": ("mjcf", "hand.draft.mujoco_model", "protocols.scene", "exchange.mjcf"),
     "coacd": ("mjcf.decomposition",),
     "pyarrow": ("exchange",),

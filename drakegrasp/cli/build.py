@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 import drakegrasp as dg
-from drakegrasp.cli.arguments import AnyPath, Count, Folder, Settings, Tls, What, Workers
+from drakegrasp.cli.arguments import AnyPath, Count, Folder, NewFile, Settings, Tls, What, Workers
 from drakegrasp.cli.console import UsageError, same_command, say
 from drakegrasp.cli.help import MORE
 from drakegrasp.errors import counted
@@ -58,6 +60,7 @@ def submit(
     own: Annotated[tuple[str, ...], Parameter(name="--with", metavar="KEY=VALUE")] = (),
     what: What,
     dry_run: bool = False,
+    script: NewFile | None = None,
     tls: Tls = Tls(),
 ) -> None:
     """Build a dataset on a cluster; the command starts the workers.
@@ -85,6 +88,7 @@ def submit(
             times.
         dry_run: Only print which workers would run, the amount of work that is known before the
             build, and the script of a job.
+        script: Only write the script of a job.
     """
     from drakegrasp.api.building import known_work
     from drakegrasp.cluster.choice import cluster_of, describe, present
@@ -106,12 +110,26 @@ def submit(
     say("\n".join(describe(cluster)))
     if dry_run:
         say("\n".join(known_work(**asked)))
-        if script := cluster.script(out):
-            say(f"\nscript of each job, for {cluster.submission()}:\n\n{script.rstrip()}\n")
-            say(f"client: {same_command(('--dry-run',), ())}")
+    if dry_run or script is not None:
+        _give_script(cluster, out, script)
         return
     joint = present(cluster.connected(out), show)
     print_report(dg.build_dataset(**asked, out=out, cluster=joint, show=show))
+
+
+def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
+    """Print or write the script of a job, and the next steps."""
+    script = cluster.script(out)
+    if not script:
+        if file is not None:
+            raise UsageError(f"--script must not be given with --cluster {cluster.kind}")
+        return
+    if file is None:
+        say(f"\nscript of each job, for {cluster.submission()}:\n\n{script.rstrip()}\n")
+    else:
+        file.write_text(script, encoding="utf-8")
+        say(f"{cluster.submission()} {shlex.quote(str(file))}")
+    say(f"client: {same_command(('--dry-run',), ('--script',))}")
 
 
 def bench_set(
