@@ -7,6 +7,7 @@ Concepts: mesh, unit, `objects.yaml`, resting pose, object frame, verification.
 
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
 
@@ -42,7 +43,18 @@ def main() -> None:
     verdict = dg.verify_grasp(dg.pack_grasp(p_OQ, nhat_Q_O), on=vase)
 
     print(verdict.explain())
-    verdict.figure().savefig("example/03_own_mesh.png")
+    verdict.save_html("example/03_own_mesh.html")  # open it in a browser
+
+    # The neck from above, with the contacts that were asked for and those that the hand made.
+    reached = verdict.trial.closed.contacts.p_OQ
+    section = 1e3 * vase.model.visual_vertices[:, :2]
+    figure, axes = plt.subplots(figsize=(4.0, 4.0))
+    axes.plot(*section.T, ".", color="lightgrey", markersize=2)
+    axes.plot(*(1e3 * p_OQ[:, :2]).T, "o", label="requested")
+    axes.plot(*(1e3 * reached[:, :2]).T, "x", label="reached")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    axes.legend()
+    figure.savefig("example/03_own_mesh.png")
 
 
 if __name__ == "__main__":
