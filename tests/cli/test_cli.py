@@ -32,7 +32,6 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
 from drakegrasp.exchange.export import export_dataset
-from drakegrasp.frames import make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.shapes.catalog import BuiltinObject
 from drakegrasp.verification.prediction import FRAMES

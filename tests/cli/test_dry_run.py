@@ -8,7 +8,6 @@ import pytest
 from helpers.commands import Result, error_line, run
 
 
-
 def dry_run(out: Path, *words: str | Path) -> Result:
     return run("build", "--objects", "builtin", "--out", out, "--dry-run", *words)
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import trimesh
@@ -13,12 +10,8 @@ from cyclopts.annotations import get_hint_name
 from helpers.commands import arguments_of, run
 from helpers.datasets import SLIPPED, end_lift
 from helpers.golden import Golden
-from rich.console import Console
-from rich.table import Table
 
 from drakegrasp.cli.main import COMMANDS, app
-from drakegrasp.cli.tables import score_table, verdict_table
-from drakegrasp.outcomes import Outcome
 
 
 def options_of(name: str) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from io import StringIO
 
 import numpy as np
-import pytest
 from rich.console import Console
 from rich.table import Table
 
