@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
@@ -310,6 +311,19 @@ class LiftPath:
             shift * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
             shift * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
         )
+
+
+def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
+    """Return the path from a resting pose (4, 4) to p_TO = `lift.p_TG`.
+
+    Without a hand, the object's origin moves to the target of the palm.
+    """
+    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+    p_WO_end = X_WT[:3, 3] + config.lift.p_TG
+    duration = lift_duration(float(np.linalg.norm(p_WO_end - X_WO[:3, 3])), config)
+    # The object may start at its target.
+    duration = max(duration, config.physics.time_step)
+    return LiftPath(X_WO=X_WO, p_WO_end=p_WO_end, duration=duration)
 
 
 def lift_duration(distance: float, config: Config) -> float:
