@@ -125,5 +125,7 @@ def score(
         if out is not None:
             say(str(out / "card.md"))
     if not quiet:
+        for name, each in scored.card["sets"].items():
+            say(f"{name}: {share_text(each['measures']['headline'], 1, ' %')}", err=True)
         for warning in scored.card["warnings"]:
             say(f"warning: {warning}", err=True)

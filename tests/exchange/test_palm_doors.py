@@ -58,7 +58,6 @@ def test_graspgen_is_verified_on_a_mesh_in_centimetres(tmp_path, monkeypatch):
     assert done.exit_code == 0, done.stderr
     verdicts = [json.loads(line) for line in done.stdout.splitlines()]
     assert [verdict["success"] for verdict in verdicts] == [True, False]
-    assert "2 of 2 rows of the postures have a palm pose and no joints" in done.stderr
     # As if it were the palm link's, the fingers close along the long edges, which are too far.
     done = run("verify", "box.yaml", *FRANKA, "--workers", "1")
     assert not any(json.loads(line)["success"] for line in done.stdout.splitlines())

@@ -80,11 +80,11 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
 
     # The same by the lift in Drake, in files.
     given = ("verify", tmp_path / "own.npz", "--object", mesh, "--workers", 1)
-    result = run(*given, "--out", tmp_path / "lift", "--json")
+    result = run(*given, "--out", tmp_path / "lift.h5", "--json")
     assert result.exit_code == 0, result.output
     held, none, lost = map(json.loads, result.stdout.splitlines())
-    assert held["held"] and held["success"] and held["method"] == "posture"
-    np.testing.assert_allclose(held["closed"]["q"], end.q, atol=1e-3)
+    assert held["held"] and held["success"] and held["fit_residual"] is None
+    np.testing.assert_allclose(held["closed_q"], end.q, atol=1e-3)
     np.testing.assert_allclose(held["X_OG"], np.asarray(record.X_OG), atol=1e-5)
     assert none["outcome"] == "invalid"
     assert none["reason"].startswith("the palm's pose must have 0 0 0 1")
