@@ -20,7 +20,6 @@ from helpers.assertions import arrays_of
 from helpers.commands import arguments_of, error_line, run
 from helpers.datasets import make_dataset
 from helpers.tiers import few
-from matplotlib.image import imread
 
 import drakegrasp as dg
 from drakegrasp.cli import main as cli
@@ -334,7 +333,6 @@ def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path
     assert "no broken invariants" in run("check", small_dataset).stdout
     stats = run("stats", small_dataset).stdout
     assert "8_wineglass_flute" in stats
-    assert "How well the hand holds" in stats
     assert "Samples by split" in stats
     page = tmp_path / "trial.html"
     again = run("replay", small_dataset, "--trial", "0", "--html", page)
@@ -387,9 +385,8 @@ def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_
     assert result.exit_code == 0, result.output
     assert f"{out}: not finished: 10 of 12 work units are done" in result.stdout
     lines = [line.split() for line in result.stdout.splitlines()]
-    funnel, hold = (line for line in lines if line[:1] == ["all"])
+    (funnel,) = (line for line in lines if line[:1] == ["all"])
     assert funnel[1:3] == ["48", "120"]
-    assert hold[1] == "120"
     shutil.rmtree(out / "shards")
     assert "not finished: 0 of 12 work units are done" in run("stats", out).stdout
 
@@ -397,47 +394,31 @@ def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_
 def test_stats_say_that_nothing_trains(out: Path) -> None:
     said = run("stats", out).stdout
     assert "split train is empty" not in said
-    assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
+    assert "Samples by split (by object)" in said
     assemble(out, overrides=["split.by=class", "split.train_classes=[]"])
     said = run("stats", out).stdout
     assert "split train is empty" in said
-    assert "split by class: 3 objects with samples, 3 of them test\n" in said
+    assert "Samples by split (by class)" in said
     # Of the frozen benchmark it is meant.
     (out / "builtin").mkdir()
     (out / "builtin" / "benchmark.json").write_text("{}")
     assert "split train is empty" not in run("stats", out).stdout
     said = run("assemble", out, "--set", "split={by: object}").stdout
-    assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
+    assert "Samples by split (by object)" in said
 
 
 def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:
-    trimesh.creation.box([0.05, 0.06, 0.07]).export(tmp_path / "1_box_a.obj")
-    _text(tmp_path)
-    result = run("audit", tmp_path)
-    assert result.exit_code == 0
-    assert "fit" in result.stdout
-    assert "refused" in result.stdout
-    assert "2 meshes: 1 fit, 0 repaired, 1 refused; 0 with a warning (!)" in result.stdout
-    line = "preparing takes up to 425 MB of a worker (1_box_a): --memory must be 450MB or more"
-    assert line in result.stdout
-
-
-def test_audit_writes_findings_and_a_sheet(tmp_path: Path) -> None:
-    meshes, found, sheet = tmp_path / "m", tmp_path / "a.json", tmp_path / "pictures" / "a.png"
+    meshes, found = tmp_path / "m", tmp_path / "a.json"
     meshes.mkdir()
     trimesh.creation.box([0.05, 0.06, 0.07]).export(meshes / "1_box_a.obj")
     _text(meshes)
-    assert run("audit", meshes, "--json", found, "--sheet", sheet).exit_code == 0
+    result = run("audit", meshes, "--json", found)
+    assert result.exit_code == 0
+    fit, refused, total = result.stdout.splitlines()
+    assert fit.split() == ["fit", "1_box_a"] and refused.startswith("refused   1_text_a: ")
+    assert total == "2 meshes: 1 fit, 0 repaired, 1 refused; 0 with a warning (!)"
     rows = {row["name"]: row for row in json.loads(found.read_text())}
     assert rows["1_box_a"]["status"] == "fit" and rows["1_box_a"]["faces"] == 12
-
-    # The picture has two places; the box is drawn in its own colour in the first.
-    picture = imread(sheet)[..., :3]
-    high, wide = picture.shape[:2]
-    assert 1.5 < wide / high < 2.0
-    left, right = picture[high // 2 :, : wide // 2], picture[high // 2 :, wide // 2 :]
-    assert np.ptp(left, axis=2).max() > 0.3
-    assert np.ptp(right, axis=2).max() < 0.3
 
 
 def test_morphs_are_told_and_bad_directories_are_refused(tmp_path: Path) -> None:
