@@ -74,7 +74,6 @@ class Outcome(IntEnum):
         "the limit of computing time passed, which says nothing about the grasp",
     )
     CRASHED = 12, "errors", "its process was killed, which says nothing about the grasp"
-    OFF_SURFACE = 14, "", "a contact, or its normal, is off the surface"  # by forces only
     # For this outcome and the next, it is unknown whether the hand would have held the object.
     MOVED = 15, "moved", "the object moved more in the hand than a sample may"
     INVALID = 17, "", "the row of numbers is not a valid grasp"  # it counts as a failure

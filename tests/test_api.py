@@ -36,12 +36,12 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.placement import PlacedObject, place_object
-from drakegrasp.verification.hints import contact_readings
+from drakegrasp.verification.hints import find_hints
 from drakegrasp.verification.placing import (
     PlacedGrasp,
+    contacts_on_object,
+    contacts_on_rows,
     dataset_config,
-    place_on_object,
-    place_on_rows,
 )
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import write_results
@@ -62,7 +62,7 @@ def cube() -> PlacedObject:
 
 
 def place(grasps: np.ndarray, cube: PlacedObject) -> list[PlacedGrasp]:
-    return place_on_object(grasps, cube, method="forces")
+    return contacts_on_object(grasps, cube)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_results_come_in_the_order_of_the_grasps(cube: PlacedObject) -> None:
     off = GRASP.copy()
     off[0, 0] = np.nan
     order = [off, GRASP, off, GRASP]
-    results = verify_grasps([g.ravel() for g in order], cube, method="forces")
+    results = verify_grasps([g.ravel() for g in order], cube)
     assert [v.outcome for v in results] == [
         Outcome.INVALID if g is off else Outcome.SUCCESS for g in order
     ]
@@ -111,7 +111,7 @@ def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
     rows += rows
     names = test_split.column("object_props/object_name")[rows]
     config, grasps = dataset_config(test_split), test_split.column("grasps")[rows]
-    placed = place_on_rows(grasps, test_split, rows, config=config)
+    placed = contacts_on_rows(grasps, test_split, rows, config=config)
     assert sorted(grasp.index for grasp in placed) == list(range(len(rows)))
     of_objects = [grasp.placed.model.name for grasp in placed]
     assert of_objects == names[[grasp.index for grasp in placed]].tolist()
@@ -149,7 +149,7 @@ def test_workers_get_tasks_of_few_grasps(
     def execute(_: object, tasks: Iterable[list[PlacedGrasp]]) -> Iterator[object]:
         for task in tasks:
             given.append(len(task))
-            yield [(grasp.index, result.findings) for grasp in task]
+            yield [(grasp.index, result.findings()) for grasp in task]
 
     monkeypatch.setattr(verifying, "joined", lambda *_: nullcontext(client))
     monkeypatch.setattr(verifying, "admitted_workers", lambda *_: nullcontext())
@@ -191,11 +191,11 @@ def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
 
     def hints(grasps: np.ndarray, frame: str) -> set[str]:
         config = dataset_config(test_split)
-        placed = place_on_rows(grasps, test_split, rows, config=config, frame=frame)
+        placed = contacts_on_rows(grasps, test_split, rows, config=config, frame=frame)
         return {
-            reading.text
+            hint
             for grasp in placed
-            for reading in contact_readings(grasp, grasp.in_object_frame()[1], fits=False)
+            for hint in find_hints(grasp, grasp.in_object_frame()[1], fits=False)
         }
 
     own = test_split.column("grasps")
@@ -214,12 +214,12 @@ def test_contacts_in_the_frame_of_the_mesh_file_are_told_and_read_on_a_sample(
     prepared = load_prepared(out, name, config)
     moved = replace(prepared.model, p_OM=np.array([0.0, 0.3, 0.0]))
     save_prepared(replace(prepared, model=moved), out, config)
-    right = verify_grasp(sample.grasp, sample, method="forces")
+    right = verify_grasp(sample.grasp, sample)
     grasp_M = transform_grasp(invert_pose(moved.X_OM), pack_grasp(right.p_OQ, right.nhat_Q_O))
-    lost = verify_grasp(grasp_M, sample, method="forces")
+    lost = verify_grasp(grasp_M, sample)
     assert lost.misplaced and lost.hints == ("the mesh file's frame (mesh)",)
     assert ". This would fit much better: the mesh file's frame (mesh). The grasp" in lost.explain()
-    found = verify_grasp(grasp_M, sample, frame="mesh", method="forces")
+    found = verify_grasp(grasp_M, sample, frame="mesh")
     np.testing.assert_allclose(found.p_OQ, right.p_OQ, atol=1e-4)
 
 
@@ -303,7 +303,7 @@ def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: P
     scaled = trimesh.creation.box([100.0 * EDGE] * 3)
     placed = place_object(box)
     on_mesh = [
-        verify_grasp(GRASP.ravel(), on, units=units, method="forces")
+        verify_grasp(GRASP.ravel(), on, units=units)
         for on, units in [(tmp_path / "cube.obj", None), (str(tmp_path / "cube.obj"), "m"),
                           (box, None), (scaled, "cm"), (placed, None)]
     ]  # fmt: skip
@@ -313,7 +313,7 @@ def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: P
     # A sample is its row, also as a copy, in another process, and of a slice.
     row = len(test_split) - 1
     sample = test_split[row]
-    by_row = verify_grasp(sample.grasp, test_split, row=row, method="forces")
+    by_row = verify_grasp(sample.grasp, test_split, row=row)
     assert by_row.config.hand == "barrett" and by_row.surface_distance.max() < 0.005
     copies = [
         sample,
@@ -323,10 +323,10 @@ def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: P
     ]
     copies.append(replace(sample, trial_id=0))
     for each in copies:
-        assert same(by_row, verify_grasp(sample.grasp, each, method="forces"))
-    pair = verify_grasps([sample.grasp, sample.grasp], sample, method="forces")
+        assert same(by_row, verify_grasp(sample.grasp, each))
+    pair = verify_grasps([sample.grasp, sample.grasp], sample)
     assert [same(by_row, each) for each in pair] == [True, True]
-    (by_rows,) = verify_grasps(sample.grasp, test_split, rows=[row], method="forces")
+    (by_rows,) = verify_grasps(sample.grasp, test_split, rows=[row])
     assert same(by_row, by_rows)
 
 
@@ -335,16 +335,16 @@ def test_tensors_go_in(cube: PlacedObject, dtype: str) -> None:
     torch = pytest.importorskip("torch")
     rounded = torch.tensor(GRASP.ravel(), dtype=getattr(torch, dtype), requires_grad=True)
     numbers = rounded.detach().double().numpy()
-    due = verify_grasp(numbers, cube, method="forces")
+    due = verify_grasp(numbers, cube)
     X_TC = torch.tensor(cube.X_TO, dtype=torch.float32, requires_grad=True)
-    assert same(due, verify_grasp(rounded, cube, method="forces"))
-    on_table = verify_grasps(rounded[None], cube, frame="camera", X_TC=X_TC, method="forces")
+    assert same(due, verify_grasp(rounded, cube))
+    on_table = verify_grasps(rounded[None], cube, frame="camera", X_TC=X_TC)
     assert same(due, on_table[0])
-    both = verify_grasps([rounded, rounded], cube, method="forces")
-    lists = verify_grasps([list(rounded), numbers.tolist()], cube, method="forces")
+    both = verify_grasps([rounded, rounded], cube)
+    lists = verify_grasps([list(rounded), numbers.tolist()], cube)
     assert all(same(due, each) for each in [*both, *lists])
-    uneven = verify_grasps([rounded, rounded[:3]], cube, method="forces")
-    assert same(due, uneven[0]) and uneven[1].outcome is Outcome.INVALID
+    with pytest.raises(GraspError, match="a grasp must be 18 numbers"):
+        verify_grasps([rounded, rounded[:3]], cube)
 
 
 def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
@@ -353,7 +353,7 @@ def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
     assert placed.config == place_object(placed).config == heavy
     # Friction and hand are no matter of the object, its mass is.
     slick = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.1"])
-    (grasp,) = place_on_object(GRASP.ravel(), place_object(placed, config=slick))
+    (grasp,) = contacts_on_object(GRASP.ravel(), place_object(placed, config=slick))
     assert grasp.config == slick
     assert place_object(placed, hand="franka").config.hand == "franka"
     with pytest.raises(ConfigError, match="objects must be as the object was placed with"):

@@ -55,8 +55,8 @@ WALLS = {
     "starlette": ("page",),
     "uvicorn": ("page",),
     "jinja2": ("page",),
-    "matplotlib": ("pictures", "verification.figure"),
-    "pydrake": (*("hand", "vision", "simulation", "mjcf", "pictures", "verification"),),
+    "matplotlib": ("pictures",),
+    "pydrake": ("hand", "vision", "simulation", "mjcf", "pictures"),
     "mujoco": ("mjcf", "hand.draft.mujoco_model", "protocols.scene", "exchange.mjcf"),
     "coacd": ("mjcf.decomposition",),
     "pyarrow": ("exchange.hub",),
@@ -65,7 +65,6 @@ WALLS = {
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {
     *((f"api.{module}", "distributed") for module in ("building", "scoring", "verifying")),
-    ("verification.result", "matplotlib"),
 }
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (

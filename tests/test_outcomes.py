@@ -21,7 +21,6 @@ TABLE = [
     ("solver_error", 10, PLACED, True),
     ("timeout", 11, PLACED, True),
     ("crashed", 12, PLACED, True),
-    ("off_surface", 14, PLACED, False),
     ("moved", 15, LIFTED, False),
     ("invalid", 17, PLACED, False),
     ("partly_held", 18, LIFTED, False),
@@ -38,7 +37,7 @@ def test_stages_are_ordered_and_frozen() -> None:
 
 
 def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:
-    assert {o.label for o in Outcome if o.verification_only} == {"off_surface", "invalid"}
+    assert {o.label for o in Outcome if o.verification_only} == {"invalid"}
 
 
 def test_no_verification_ends_a_lift_early() -> None:

@@ -7,6 +7,7 @@ Concepts: mesh, unit, `objects.yaml`, resting pose, object frame, verification.
 
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
 
@@ -34,15 +35,24 @@ def main() -> None:
     vase = dg.place_object(MESHES / "1_vase.stl")
     print(vase)
 
-    # Three contacts around the neck in the object frame {O}, whose origin is the centre of the
-    # bounding box. Normals point out of the object.
+    # Three contacts around the neck in {O}, whose origin is the centre of the bounding box.
     angles = np.deg2rad([60.0, -60.0, 180.0])
     nhat_Q_O = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
     p_OQ = 0.026 * nhat_Q_O + [0.0, 0.0, 0.02]  # [m]
     verdict = dg.verify_grasp(dg.pack_grasp(p_OQ, nhat_Q_O), on=vase)
 
     print(verdict.explain())
-    verdict.figure().savefig("example/03_own_mesh.png")
+    verdict.save_html("example/03_own_mesh.html")  # open it in a browser
+
+    # The neck from above, with the contacts that were asked for and those that the hand made.
+    reached = verdict.trial.closed.contacts.p_OQ
+    figure, axes = plt.subplots(figsize=(4.0, 4.0))
+    axes.plot(*(1e3 * vase.model.visual_vertices[:, :2]).T, ".", color="lightgrey", markersize=2)
+    axes.plot(*(1e3 * p_OQ[:, :2]).T, "o", label="requested")
+    axes.plot(*(1e3 * reached[:, :2]).T, "x", label="reached")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    axes.legend()
+    figure.savefig("example/03_own_mesh.png")
 
 
 if __name__ == "__main__":

@@ -33,15 +33,12 @@ def main() -> None:
         verdicts = dg.verify_grasps(data.column("grasps"), on=data, client=client)
     Path("example/scheduler.json").unlink()
 
-    # The smallest friction coefficient at which forces at the contacts can hold the object: the
-    # less a grasp needs, the larger is its margin.
+    # The epsilon of Ferrari and Canny: the smallest wrench that the contacts cannot resist.
     figure, axes = plt.subplots(figsize=(5.0, 2.6))
     colours = ["tab:green" if verdict.held else "tab:red" for verdict in verdicts]
-    axes.bar(range(len(verdicts)), [v.smallest_friction for v in verdicts], color=colours)
-    axes.axhline(config.physics.friction_hand, color="black", label="friction in the simulation")
-    axes.set(xlabel="verified grasp (green: held)", ylabel="smallest friction", ylim=(0.0, 1.0))
+    axes.bar(range(len(verdicts)), [verdict.epsilon for verdict in verdicts], color=colours)
+    axes.set(xlabel="verified grasp (green: held)", ylabel="epsilon of the contacts")
     axes.set_xticks(range(len(verdicts)))
-    axes.legend(loc="upper left")
     figure.tight_layout()
     figure.savefig("example/05_cluster.png")
 

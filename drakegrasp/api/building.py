@@ -18,7 +18,6 @@ from drakegrasp.cluster.wire import by_wire
 from drakegrasp.config import BUILD_PRESET, Config
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
-from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.errors import DataError, GraspError, counted
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.foreign_files import refuse_address
@@ -218,27 +217,15 @@ def known_work(
     if work.postures is not None:
         rows = sum(len(work.postures.of_object(name)) for name in work.names)
         return [f"{counted(count, 'object')}: {counted(rows, 'posture')}"]
-    if config.has_target:
-        return _target_lines(config, count)
     poses = config.candidates.max
     number = count * sum(1 for _ in config.unit_ranges(poses))
     palms = counted(count * poses, "palm pose")
-    return [f"{counted(count, 'object')}: at most {palms} in {counted(number, 'work unit')}"]
-
-
-def _target_lines(config: Config, objects: int) -> list[str]:
-    """Return what ends a build with a target, and the size of the images of its samples."""
-    each = config.samples_per_object
     ends = [counted(config.samples, "sample")] if config.samples is not None else []
+    each = config.samples_per_object
     ends += [f"{counted(each, 'sample')} of each"] if each is not None else []
-    palms = counted(config.candidates.max, "palm pose")
-    lines = [f"{counted(objects, 'object')}: until {' or '.join(ends)}, at most {palms} of each"]
-    wanted = [n for n in (config.samples, each and objects * each) if n is not None]
-    # Their size on the disk depends on how well they can be compressed.
-    images = [field.empty(1, {"S": config.camera.size}) for field in DATA_FIELDS if field.sample]
-    size = min(wanted) * len(CAMERAS) * sum(image.nbytes for image in images)
-    images_of = f"images of {counted(min(wanted), 'sample')}"
-    return [*lines, f"{images_of}: {size / 1e6:,.1f} MB before compression"]
+    until = f"until {' or '.join(ends)}, " if ends else ""
+    units = counted(number, "work unit")
+    return [f"{counted(count, 'object')}: {until}at most {palms} in {units}"]
 
 
 def make_benchmark(

@@ -39,7 +39,7 @@ def verify_by_protocol(
     """Try the first wrist pose of grasps of one hand, in their order.
 
     Args:
-        grasps: See `api.verifying.place_grasps`.
+        grasps: See `verification.placing`.
         config: Their configuration, with the hand.
         protocol: Name of a protocol that runs in MuJoCo, or `FILE.py:NAME`.
         on_result: Receives the verdicts.

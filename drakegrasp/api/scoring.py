@@ -23,11 +23,8 @@ from drakegrasp.scoring.run import Method, Score
 from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import GraspRows
-from drakegrasp.verification.placing import (
-    dataset_config,
-    overridden_keys,
-    place_on_rows,
-)
+from drakegrasp.verification.placing import dataset_config, overridden_keys
+from drakegrasp.verification.postures import place_on_rows
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, Unpack
+from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -19,22 +19,17 @@ from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, joined
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange.columns import HDF5_SUFFIXES
-from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.simulation.attempts import Attempts, GraspRows
 from drakegrasp.simulation.placement import Placed, place_object
 from drakegrasp.verification.placing import (
     PlacedGrasp,
-    RowChoice,
+    contacts_on_object,
+    contacts_on_rows,
     dataset_config,
-    place_on_dataset,
-    place_on_object,
-    place_on_rows,
 )
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import ResultCallback, ignore_result, verify_batch
@@ -64,8 +59,6 @@ def verify_grasp(
     units: str | None = None,
     X_TO: npt.ArrayLike | None = None,
     hand: str | Path | None = None,
-    method: str = "hand",
-    snap_points: bool = False,
     config: Config | None = None,
 ) -> Verification:
     """Return whether a predicted grasp holds its object in the simulator, and the reason.
@@ -85,8 +78,6 @@ def verify_grasp(
         units: Unit of a mesh: m, cm or mm.
         X_TO: Pose (4, 4) of an object on the table.
         hand: Name or YAML file of the hand.
-        method: "hand" or "forces".
-        snap_points: Whether to move the points to the object's surface first.
         config: Hand, physics, lift and rules.
 
     Returns:
@@ -101,25 +92,31 @@ def verify_grasp(
     if row is None and isinstance(on, GraspDataset):
         raise GraspError(f"row must be given with a GraspDataset, 0 to {len(on) - 1}, got None")
 
-    placed, used = place_grasps(
+    if (count := _count(grasp)) != 1:
+        raise GraspError(
+            f"one grasp must be a vector, got {count} grasps; many go into verify_grasps"
+        )
+    rows = None if row is None else [row]
+    (verdict,) = verify_grasps(
         grasp,
         on,
-        row,
+        rows=rows,
         frame=frame,
         X_TC=X_TC,
         units=units,
         X_TO=X_TO,
         hand=hand,
-        method=method,
-        snap_points=snap_points,
         config=config,
     )
-    if len(placed) != 1:
-        raise GraspError(
-            f"one grasp must be a vector, got {len(placed)} grasps; many go into verify_grasps"
-        )
-    (verdict,) = run_verification(placed, used, show=False, explained=False)
     return verdict
+
+
+def _count(grasps: Any) -> int:
+    """Return the number of grasps; 1 for what is no array, which is refused when it is read."""
+    try:
+        return len(grasps) if np.ndim(grasps) > 1 else 1
+    except ValueError:
+        return 1
 
 
 def verify_grasps(
@@ -132,8 +129,6 @@ def verify_grasps(
     units: str | None = None,
     X_TO: npt.ArrayLike | None = None,
     hand: str | Path | None = None,
-    method: str = "hand",
-    snap_points: bool = False,
     config: Config | None = None,
     client: Client | None = None,
     show: bool = False,
@@ -162,10 +157,6 @@ def verify_grasps(
             in the folder of the mesh overrides it. Grasps are always in metres.
         X_TO: Only for an object: its pose on the table, (4, 4).
         hand: Name or YAML file of the hand; None for the hand of the configuration or the dataset.
-        method: "hand" closes a simulated hand on the contacts and lifts. "forces" computes whether
-            forces at the surface contacts that the grasp selects can lift the object.
-        snap_points: Whether to move the points, but not the normals, to the closest points of the
-            object's surface first.
         config: Hand, physics, lift and rules. If None, those of the placed object or of the
             dataset, or else the defaults. If it replaces a dataset's, values drawn for a row are
             not used.
@@ -176,115 +167,39 @@ def verify_grasps(
     Raises:
         GraspError: If the array does not hold grasps, `on` is not a valid target, an argument does
             not apply to the target, a row does not exist, the number of rows is not that of the
-            grasps, or a frame, pose or method is invalid.
+            grasps, or a frame or pose is invalid.
         MeshError: If a mesh cannot be simulated or does not come to rest.
         ConfigError: If config is not a `Config`, or the object was prepared with other values.
         HandError: If the hand cannot be used.
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
-    placed, used = place_grasps(
-        grasps,
-        on,
-        rows,
-        frame=frame,
-        X_TC=X_TC,
-        units=units,
-        X_TO=X_TO,
-        hand=hand,
-        method=method,
-        snap_points=snap_points,
-        config=config,
-    )
+    placed: list[PlacedGrasp]
+    if isinstance(on, Sample | GraspDataset):
+        for name, value in {"X_TC": X_TC, "units": units, "X_TO": X_TO}.items():
+            if value is not None:
+                raise GraspError(
+                    f"{name} must be None on a {type(on).__name__}, which defines it, got a value"
+                )
+        if isinstance(on, Sample) and rows is not None:
+            raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
+        data, chosen = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
+        used = dataset_config(data, config, hand)
+        # A given configuration is used as it is; that of a dataset has the rows' draws.
+        drawn, frame = config is None, frame or "camera"
+        placed = contacts_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
+    else:
+        _refuse_other_targets(on)
+        if rows is not None:
+            raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
+        thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
+        placed = contacts_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC)
+        used = thing.config
     return run_verification(placed, used, client=client, show=show, explained=False)
 
 
-def place_grasps(
-    grasps: npt.ArrayLike | GraspRows,
-    on: GraspTarget,
-    rows: RowChoice = None,
-    *,
-    frame: str | None = None,
-    X_TC: npt.ArrayLike | None = None,
-    units: str | None = None,
-    X_TO: npt.ArrayLike | None = None,
-    hand: str | Path | None = None,
-    method: str = "hand",
-    snap_points: bool = False,
-    config: Config | None = None,
-    overrides: tuple[str, ...] = (),
-) -> tuple[list[PlacedGrasp], Config]:
-    """Return grasps on their target, and the configuration, as `run_verification` takes them.
-
-    Args:
-        grasps: As for `verify_grasps`, or a table of contacts or postures, see `read_attempts`.
-        on: As for `verify_grasps`, or the directory of a dataset whose objects the postures name.
-        rows: See `verify_grasps`, as for all arguments but the last.
-        frame: See `verify_grasps`.
-        X_TC: See `verify_grasps`.
-        units: See `verify_grasps`.
-        X_TO: See `verify_grasps`.
-        hand: See `verify_grasps`.
-        method: See `verify_grasps`.
-        snap_points: See `verify_grasps`.
-        config: See `verify_grasps`; it has the overrides already.
-        overrides: `"key=value"` settings that override the configuration of a dataset, and values
-            that were drawn for a row.
-
-    Raises:
-        GraspError, MeshError, ConfigError, HandError, DataError: As `verify_grasps`.
-    """
-    _refuse_other_targets(on)
-    if not isinstance(on, Sample | GraspDataset):
-        if rows is not None:
-            raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
-        if isinstance(grasps, Attempts) and isinstance(on, Path) and on.is_dir():
-            used = override_config(read_manifest(on).config, overrides)
-            own = used if overrides else None
-            return place_on_dataset(grasps, on, own, overrides=overrides), used
-        thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
-        placed = place_on_object(
-            grasps,
-            thing,
-            frame=frame or "object",
-            X_TC=X_TC,
-            method=method,
-            snap_points=snap_points,
-            overrides=overrides,
-        )
-        return placed, thing.config
-    _refuse_given(on, X_TC=X_TC, units=units, X_TO=X_TO)
-    if isinstance(on, Sample) and rows is not None:
-        raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
-    data, rows = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
-    # A given configuration is used as it is; that of a dataset is combined with the rows' draws.
-    overrides = overrides if config is None else ()
-    used = dataset_config(data, config, hand, overrides)
-    placed = place_on_rows(
-        grasps,
-        data,
-        rows,
-        config=used,
-        drawn=config is None,
-        frame=frame or "camera",
-        method=method,
-        snap_points=snap_points,
-        overrides=overrides,
-    )
-    return placed, used
-
-
-def _refuse_given(on: Sample | GraspDataset, **fixed: object) -> None:
-    """Reject values that the rows of a dataset define."""
-    for name, value in fixed.items():
-        if value is not None:
-            raise GraspError(
-                f"{name} must be None on a {type(on).__name__}, which defines it, got a value"
-            )
-
-
 def _refuse_other_targets(on: object) -> None:
-    if not isinstance(on, str | Path | trimesh.Trimesh | Placed | Sample | GraspDataset):
+    if not isinstance(on, str | Path | trimesh.Trimesh | Placed):
         raise GraspError(
             "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a Sample or a "
             f"GraspDataset, got a {type(on).__name__}"

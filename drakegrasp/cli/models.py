@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -48,7 +49,6 @@ def audit(
             barrett]
         json_file: Write all findings as JSON.
     """
-    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
     from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import write_atomic
@@ -57,12 +57,13 @@ def audit(
     limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
     with progress_bar("audit", "meshes") as progress:
         rows = audit_meshes(mesh_dir, units=units, manifest=manifest, **limits, progress=progress)
-    console = make_console()
-    console.print(audit_table(rows, compact=console.width < ROOMY))
-    say(audit_line(rows))
-    if line := memory_line(rows):
-        say(line)
-
+    for row in rows:
+        words = "; ".join([*row.notes, *(f"! {text}" for text in row.warnings)])
+        say(f"{row.status:<9} {row.name}{': ' * bool(words)}{words}")
+    counts = Counter(row.status for row in rows)
+    told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
+    warned = sum(bool(row.warnings) for row in rows)
+    say(f"{counted(len(rows), 'mesh', 'meshes')}: {told}; {warned} with a warning (!)")
     if json_file is not None:
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)
         write_atomic(json_file, f"{text}\n".encode())

@@ -17,7 +17,6 @@ from drakegrasp.errors import GraspError, MeshError
 
 if TYPE_CHECKING:
     from drakegrasp.arithmetic import Array
-    from drakegrasp.hand.description import Hand
     from drakegrasp.scoring.network import GraspNetwork
     from drakegrasp.simulation.attempts import Attempts
 
@@ -29,8 +28,6 @@ KINDS = {
     "a cloud": ("units",),
     "a depth image": ("camera", "mask", "camera_pose", "depth_scale"),
 }
-#: Number of grasps in the printed table.
-SHOWN = 5
 
 
 def predict(
@@ -76,7 +73,7 @@ def predict(
             [default: from the plane on which the object stands]
         depth_scale: Unit of a .png depth image. [default: 0.001]
         workers: Number of processes for scenes. [default: one per core]
-        quiet: Show neither progress nor the table.
+        quiet: Show no progress.
     """
     from drakegrasp.exchange.attempts import write_attempts
 
@@ -110,8 +107,6 @@ def predict(
     found = chosen.predict(cloud, count=count)
     write_attempts(out, _seen_from(found, pose), chosen.hand, network=chosen.name)
     say(str(out))
-    if not quiet:
-        _print_best(found, pose, chosen.hand)
 
 
 def _refuse_place(out: Path, source: Path) -> None:
@@ -122,13 +117,13 @@ def _refuse_place(out: Path, source: Path) -> None:
         DataError: If it cannot be written.
     """
     from drakegrasp.exchange.attempts import holds_postures
-    from drakegrasp.verification.result_files import refuse_unwritable_files
+    from drakegrasp.verification.result_files import refuse_unwritable
 
     if out.suffix.lower() not in HDF5:
         raise UsageError(f"--out must be a file {' or '.join(HDF5)}, got {str(out)!r}")
     if out.exists() and out.samefile(source):
         raise UsageError(f"--out must be another file than INPUT, got {str(out)!r}")
-    refuse_unwritable_files(out)
+    refuse_unwritable(out)
     try:
         known = not out.exists() or holds_postures(out)
     except GraspError:  # no HDF5 file
@@ -273,29 +268,3 @@ def _seen_from(found: Attempts, X_TC: Array | None) -> Attempts:
         return found
     X_CG = multiply(invert_pose(X_TC), found.X_FG)
     return replace(found, X_FG=X_CG, frame="camera", X_TC=X_TC[None].repeat(len(found), axis=0))
-
-
-def _print_best(found: Attempts, X_TC: Array | None, hand: Hand) -> None:
-    """Print the best grasps: score, directions of approach and of closing, and palm's position."""
-    from drakegrasp.cli.tables import make_table, print_table
-    from drakegrasp.hand.finger_sweep import find_opposition
-
-    frames = {"{T}": found.X_FG}
-    if X_TC is not None:
-        frames["{C}"] = _seen_from(found, X_TC).X_FG
-    heads = ["grasp", "score"]
-    along, _ = find_opposition(hand)
-    for frame in frames:
-        heads += [f"approach\nin {frame}", f"closes along\nin {frame}", f"palm in\n{frame} [mm]"]
-    rows = []
-    for i, score in enumerate(found.confidence[:SHOWN].tolist()):
-        cells = [str(i), f"{score:.3f}"]
-        for X_FG in frames.values():
-            cells += [_numbers(axis, "z.2f") for axis in (X_FG[i, :3, 2], X_FG[i, :3, :3] @ along)]
-            cells += [_numbers(1e3 * X_FG[i, :3, 3], "z.0f")]
-        rows.append(cells)
-    print_table(make_table("The best grasps", heads, rows))
-
-
-def _numbers(values: Array, form: str) -> str:
-    return " ".join(f"{value:{form}}" for value in values.tolist())

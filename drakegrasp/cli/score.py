@@ -75,7 +75,7 @@ def score(
             [default: nothing is written]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
         as_json: Print the card as JSON.
-        quiet: Show neither progress nor the table.
+        quiet: Show neither progress nor warnings.
         train: Data file whose training rows are used for the reference rows. [default: --dataset]
         frame: Frame of all postures, which overrides their files.
         link: Frame or link of the poses in files of postures, which overrides the files: palm, the
@@ -85,7 +85,6 @@ def score(
         protocol: The rule of a verdict, see `drakegrasp verify`. All protocols except lift try the
             first wrist pose of a prediction in MuJoCo.
     """
-    from drakegrasp.cli.tables import make_console, score_table
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.scenes import open_rows
     from drakegrasp.exchange.attempts import holds_postures
@@ -126,6 +125,7 @@ def score(
         if out is not None:
             say(str(out / "card.md"))
     if not quiet:
-        make_console(stderr=True).print(score_table(scored.card, scored.seconds))
+        for name, each in scored.card["sets"].items():
+            say(f"{name}: {share_text(each['measures']['headline'], 1, ' %')}", err=True)
         for warning in scored.card["warnings"]:
             say(f"warning: {warning}", err=True)

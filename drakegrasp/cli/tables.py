@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
-from rich.measure import Measurement
 from rich.table import Table
 
 from drakegrasp.cli.console import say
@@ -27,22 +24,16 @@ from drakegrasp.dataset.statistics import (
 from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
-from drakegrasp.objects.audit import AuditRow
-from drakegrasp.objects.model import needed_limit
 from drakegrasp.outcomes import GROUPS, Outcome
 
 if TYPE_CHECKING:
-    from drakegrasp.verification.result import Verification
+    pass
 
 #: Outcomes in the order of the funnel. Outcomes that only verdicts have are not among them.
 _FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
 #: Maximum number of objects without samples whose reasons are printed.
 BARREN = 10
-#: Smallest width of a terminal for which the audit has all of its columns [characters].
-ROOMY = 110
-#: Maximum width of the notes of an audit [characters].
-NOTES = 60
-#: Width of the console if standard output is not a terminal [characters]: every table fits.
+#: Width of the console [characters]: every table fits.
 WIDTH = 1000
 
 
@@ -105,62 +96,40 @@ def _head(outcome: Outcome) -> str:
     return short.replace("_", "\n")
 
 
-def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
+def funnel_table(funnel: Funnel) -> Table:
     """Return the funnel, with a row per object and a row for all objects.
 
-    Args:
-        funnel: The counts.
-        compact: Whether to group outcomes; if not, columns that contain only zeros are left out.
+    Columns that contain only zeros are left out.
     """
     shown = [o for o in _FUNNEL if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
-    groups = {_head(o): [o] for o in shown}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
-    if compact:
-        # Space is scarce, and few datasets have lifts that were ended early.
-        there, removed = funnel.outcomes.sum(axis=0), []
-        groups = {name: [o for o in _FUNNEL if o.group == name] for name in GROUPS}
-        groups = {h: g for h, g in groups.items() if h != "moved" or there[g].any()}
-    heads = ["poses", "attempts", *groups]
+    heads = ["poses", "attempts", *map(_head, shown), "precision", "stable"]
     heads += [f"- {r.label}".replace("_", "\n") for r in removed] + ["samples", "distinct"]
 
     def row(objects: slice) -> list[str]:
         outcomes = funnel.outcomes[objects].sum(axis=0).tolist()
         cells = [funnel.candidates[objects].sum(), sum(outcomes)]
-        cells += [sum(outcomes[o] for o in group) for group in groups.values()]
+        cells += [outcomes[o] for o in shown]
+        cells += [funnel.precision[objects].sum(), funnel.stable[objects].sum()]
         cells += [funnel.removals[objects, r].sum() for r in removed]
         cells += [funnel.samples[objects].sum(), funnel.distinct[objects].sum()]
         return list(map(_count, cells))
 
-    caption = "distinct: samples whose palms are within 20 mm and 30° of each other count as one"
+    notes = [
+        "precision: successes that the fingertips alone hold; stable: precision, and the object "
+        "moved by less than 5 mm and 5° in the hand",
+        "distinct: samples whose palms are within 20 mm and 30° of each other count as one",
+        held_note(funnel),
+    ]
+    caption = "\n".join(filter(None, notes))
     return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
 
 
-def hold_table(funnel: Funnel) -> Table:
-    """Return how well the successes hold, with a row per object and a row for all objects."""
-    notes = [
-        "held: the outcome success; precision: held with the fingertips alone; stable: precision, "
-        "and the object moved by less than 5 mm and 5° in the hand"
-    ]
-    held, stable = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable
-    if note := held_note(funnel):
-        notes.append(note)
-
-    def row(objects: slice) -> list[str]:
-        counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
-        samples = _count(funnel.samples[objects].sum())
-        all_held, all_stable = int(held[objects].sum()), int(stable[objects].sum())
-        share = f"{all_stable / all_held:.0%}" if all_held else "-"
-        return [*(_count(count[objects].sum()) for count in counts), share, samples]
-
-    heads = ["attempts", "held", "precision", "stable", "stable\nof held", "samples"]
-    return _table_of_objects("How well the hand holds", heads, funnel, row, "\n".join(notes))
-
-
-def split_table(counts: Sequence[SplitCount]) -> Table:
+def split_table(counts: Sequence[SplitCount], rule: str) -> Table:
     """Return the paper's Table III with an additional column of objects."""
     heads = ("split", "samples", "distinct", "objects", "classes")
     rows = ([c.split, *(_count(getattr(c, name)) for name in heads[1:])] for c in counts)
-    return make_table("Samples by split", heads, rows)
+    return make_table(f"Samples by split (by {rule})", heads, rows)
 
 
 def approach_line(funnel: Funnel) -> str:
@@ -175,16 +144,6 @@ def approach_line(funnel: Funnel) -> str:
     return f"{found} in {cells}; above the table they come from {shares}"
 
 
-def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
-    """Return a line with the rule of the split and the number of tested objects."""
-    objects = {count.split: count.objects for count in counts}
-    total = np.count_nonzero(funnel.samples)
-    # In a split by class, the objects for validation are those for training.
-    valid = f", {objects['valid']:,} valid" if rule == "object" else ""
-    some = counted(int(total), "object")
-    return f"split by {rule}: {some} with samples, {objects['test']:,} of them test{valid}"
-
-
 def barren_lines(funnel: Funnel) -> list[str]:
     """Return why objects have no sample: a line for each of the first, and one for the others."""
     why = [f"no sample of {_safe(n)}: {w}" for n, w in objects_without_samples(funnel).items()]
@@ -192,48 +151,8 @@ def barren_lines(funnel: Funnel) -> list[str]:
     return why[:BARREN] + ([f"no sample of {counted(left, 'other object')}"] if left > 0 else [])
 
 
-#: Columns of the audit: head, cell, and whether a narrow terminal also shows it.
-_AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
-    ("faces", lambda row: _number(row.faces, ","), True),
-    ("size [mm]", lambda row: "x".join(f"{1e3 * e:.0f}" for e in row.extents or ()) or "-", True),
-    ("bodies", lambda row: _number(row.bodies, ","), False),
-    ("water-\ntight", lambda row: {True: "yes", False: "no", None: "-"}[row.watertight], False),
-    ("wall\n[mm]", lambda row: _number(row.wall, ".1f", 1e3), False),
-    ("contact\n[mm]", lambda row: _number(row.collision_error, ".1f", 1e3), False),
-    ("memory\n[MB]", lambda row: _number(row.memory, ".0f", 1e-6), False),
-    ("prepare\n[MB]", lambda row: _number(row.preparing, ".0f", 1e-6), False),
-)
-
-
-def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
-    """Return the findings of an audit, with one row per mesh.
-
-    Args:
-        rows: The findings.
-        compact: Whether to leave out columns whose unusual values also appear in warnings.
-    """
-    # A narrow terminal has few columns; unusual values are reported in words in any case.
-    columns = [column for column in _AUDIT if column[2] or not compact]
-    heads = ("object", "status", *(head for head, _, _ in columns))
-    table = make_table("Meshes", heads, ())
-    table.columns[0].max_width, table.columns[1].justify = 24 if compact else 40, "left"
-    table.add_column("notes, and what may be wrong (!)", overflow="fold", max_width=NOTES)
-    colours = {"fit": "green", "repaired": "yellow", "refused": "red"}
-    for row in rows:
-        status = f"[{colours[row.status]}]{row.status}[/]"
-        words = [*row.notes, *(f"! {text}" for text in row.warnings)]
-        cells = (cell(row) for _, cell, _ in columns)
-        table.add_row(_safe(row.name), status, *cells, "\n".join(map(_safe, words)))
-    return table
-
-
 def _count(number: int) -> str:
     return f"{int(number):,}"
-
-
-def _number(value: float | None, form: str, unit: float = 1) -> str:
-    """Return a number times a unit as text, or a dash if it is unknown."""
-    return "-" if value is None or np.isnan(value) else f"{unit * value:{form}}"
 
 
 def _safe(text: str) -> str:
@@ -241,81 +160,9 @@ def _safe(text: str) -> str:
     return escape(printable(text))
 
 
-def audit_line(rows: Sequence[AuditRow]) -> str:
-    """Return how many meshes are fit, repaired and refused, and how many have a warning."""
-    counts = Counter(row.status for row in rows)
-    told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
-    warned = sum(bool(row.warnings) for row in rows)
-    return f"{counted(len(rows), 'mesh', 'meshes')}: {told}; {warned} with a warning (!)"
-
-
-def memory_line(rows: Sequence[AuditRow]) -> str:
-    """Return the memory to prepare the largest mesh, as a line; empty if no mesh can be read."""
-    known = {row.name: row.preparing for row in rows if row.preparing is not None}
-    if not known:
-        return ""
-    largest = max(known, key=lambda name: known[name])
-    limit = needed_limit(known[largest])
-    return (
-        f"preparing takes up to {known[largest] / 1e6:.0f} MB of a worker ({printable(largest)}): "
-        f"--memory must be {limit / 1e6:.0f}MB or more"
-    )
-
-
-def verdict_table(results: Sequence[Verification]) -> Table:
-    """Return the outcomes of grasps, with fractions of the grasps that could be judged."""
-    counts = Counter(result.outcome for result in results)
-    judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
-    others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
-
-    def row(label: str, count: int, known: bool = True) -> list[str]:
-        return [label, _count(count), f"{count / judged:.1%}" if known and judged else "-"]
-
-    # The outcomes of the first trials; then stricter and weaker criteria than held.
-    ended = [row("held", counts[Outcome.SUCCESS])]
-    ended += [row(o.label, counts[o], not o.inconclusive) for o in others]
-    more = [row(words, sum(getattr(r, n) for r in results)) for n, words in _VERDICTS.items()]
-    total = ["all", _count(len(results)), ""]
-    table = make_table("Verdicts", ("outcome", "grasps", "share"), ended, [total], more)
-    table.columns[0].max_width = None  # our own labels, which are whole
-    return table
-
-
-#: Labels in a table for the attributes of a verdict.
-_VERDICTS = {
-    "success": "success: contacts as requested",
-    "precision": "precision",
-    "stable": "stable",
-    "sample": "sample (images not judged)",
-    "held_any": "held by any of the wrist poses",
-}
-
-
-def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
-    """Return the sets of a score card, one row per set, with seconds per verdict of the lift."""
-    names = [name for name in card["measures"] if name != "headline"]
-    protocol = card["settings"].get("protocol")
-    counts = "Sample" if protocol is None else f"By {protocol['protocol']}"
-    objects = counted(card["objects"], "object")
-    title = f"{counts}, success@1, first wrist pose, mean over {objects} [%]"
-    drawn = card["intervals"]["drawn"]
-    timed = ["s per\nverdict"] * (protocol is None)
-
-    def row(name: str, values: Mapping[str, Mapping[str, float]]) -> list[str]:
-        value, low, high = (100 * values["headline"][key] for key in ("value", "low", "high"))
-        cells = [name, f"{value:.1f}", f"{low:.0f} to {high:.0f}" if low < high else "-"]
-        cells += [f"{100 * values[measure]['value']:.0f}" for measure in names]
-        return cells + [f"{seconds[name]:.2f}" for _ in timed]
-
-    heads = ("set", "headline", "95 %\ninterval", *names, *timed)
-    rows = (row(name, each["measures"]) for name, each in card["sets"].items())
-    return make_table(title, heads, rows, caption=f"intervals: bootstrap over {drawn}")
-
-
-def make_console(*, stderr: bool = False) -> Console:
-    """Return a console for tables; if the output is not a terminal, every table fits."""
-    console = Console(stderr=stderr)
-    return console if console.is_terminal else Console(width=WIDTH, stderr=stderr)
+def make_console() -> Console:
+    """Return a console for tables, in which every table fits; a terminal wraps long lines."""
+    return Console(width=WIDTH)
 
 
 def print_table(table: Table) -> None:
@@ -326,17 +173,9 @@ def print_table(table: Table) -> None:
 def print_stats(out: Path) -> None:
     """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
     console, funnel = make_console(), count_funnel(out)
-    table = funnel_table(funnel)
-    # Rich would truncate numbers in a narrow terminal; the compact table has fewer columns.
-    natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
-    if natural > console.width:
-        table = funnel_table(funnel, compact=True)
-    console.print(table)
-    console.print(hold_table(funnel))
+    console.print(funnel_table(funnel))
     console.print()
-    splits = count_splits(out)
-    console.print(split_table(splits))
-    say(split_line(read_manifest(out).config.split.by, funnel, splits))
+    console.print(split_table(count_splits(out), read_manifest(out).config.split.by))
     if line := approach_line(funnel):
         say(line)
     for line in barren_lines(funnel):

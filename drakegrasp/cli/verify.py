@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import re
+import sys
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -24,21 +26,18 @@ from drakegrasp.cli.arguments import (
 )
 from drakegrasp.cli.console import UsageError, say, wrong_input
 from drakegrasp.cli.help import MORE
-from drakegrasp.errors import GraspError, listed
+from drakegrasp.errors import GraspError, counted, listed
 
 if TYPE_CHECKING:
     from drakegrasp.config import Config
     from drakegrasp.dataset.reader import PredictedRows
     from drakegrasp.protocols.postures import PostureResult, PostureTrials
-    from drakegrasp.simulation.attempts import Attempts
+    from drakegrasp.simulation.attempts import Attempts, Rows
     from drakegrasp.verification.placing import PlacedGrasp
-    from drakegrasp.verification.prediction import ContactRows
     from drakegrasp.verification.result import Verification
 
 #: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
-#: Rows as text: numbers of at most seven digits, and ranges of them.
-ROWS = re.compile(r"\d{1,7}(-\d{1,7})?(,\s*\d{1,7}(-\d{1,7})?)*")
 
 
 @Parameter(name="*")
@@ -58,13 +57,6 @@ class Target:
         config: Configuration: a file, or the preset paper, fast, randomized or released. [default:
             that of the dataset, else the defaults]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
-        method: hand: close a simulated hand on the contacts and lift. forces: compute whether
-            forces at the points of the surface that the contacts select can lift the object.
-        rows: With --dataset: for each grasp its row of the split, if the file does not specify it,
-            e.g. 0,4,7-9 or a .npy file. [default: all rows]
-        camera: With --object and --frame camera: .npy file with the camera's pose in the table-top
-            frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).
-        snap_points: First move the points, but not the normals, to the surface of the object.
         link: Frame or link of the poses in files of postures, which overrides the files: palm, the
             palm link, or a frame of another tool that the hand file names, e.g. graspgen.
         preshape: Preshape for rows of postures that name none; the value each, for palm poses
@@ -79,10 +71,6 @@ class Target:
     hand: Annotated[str | None, Parameter(metavar="NAME|YAML|XML")] = None
     config: Preset | None = None
     overrides: Settings = ()
-    method: Literal["hand", "forces"] = "hand"
-    rows: Annotated[str | None, Parameter(group=MORE, metavar="ROWS")] = None
-    camera: Annotated[AnyPath | None, Parameter(group=MORE, metavar="FILE")] = None
-    snap_points: Annotated[bool, Parameter(group=MORE)] = False
     link: Annotated[Name | None, Parameter(group=MORE)] = None
     preshape: Annotated[Name | None, Parameter(group=MORE)] = None
 
@@ -109,11 +97,10 @@ def verify(
     /,
     *,
     target: Target = Target(),
-    out: Annotated[AnyPath | None, Parameter(metavar="NAME")] = None,
+    out: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
     as_json: AsJson = False,
     quiet: bool = False,
     protocol: Annotated[str, Parameter(group=MORE, metavar="NAME|FILE.py:NAME")] = "lift",
-    simulator: Annotated[Literal["drake", "mujoco"] | None, Parameter(group=MORE)] = None,
     assets: Annotated[AnyPath | None, Parameter(group=MORE, metavar="DIR")] = None,
     workers: Workers = Workers(),
 ) -> None:
@@ -138,114 +125,109 @@ def verify(
     If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the command
     tries the grasps of that dataset.
 
-    One line of JSON per grasp is written to standard output or NAME.jsonl, and a table of the
-    outcomes to standard error. A row that is not a valid grasp has the outcome `invalid`. The exit
-    code is 0 if every grasp has a verdict, whatever it is, and 2 if the input cannot be used.
+    One line of JSON per grasp is written to standard output as soon as its verdict is known, and
+    the counts of the outcomes to standard error. A row that is not a valid grasp has the outcome
+    `invalid`. The exit code is 0 if every grasp has a verdict, whatever it is, and 2 if the input
+    cannot be used.
 
     Args:
         grasps: The predicted grasps.
-        out: Write NAME.jsonl and NAME.h5 instead of printing JSON lines.
-        as_json: Print the JSON lines even with --out, without progress and table.
-        quiet: Show neither progress nor the table.
+        out: Write all verdicts to this HDF5 file (.h5) instead of printing JSON lines.
+        as_json: Print the JSON lines even with --out, and neither progress nor counts.
+        quiet: Show neither progress nor counts.
         protocol: The rule of the verdict: lift, dexgraspbench, dexgraspbench-tabletop,
             dexonomy-hard, dexonomy-hard-as-run, or your own class. All protocols except lift run in
             MuJoCo.
-        simulator: Reject a protocol that runs in the other simulator. [default: either]
         assets: With files of DexGraspBench: the folder to which their object paths are relative.
             [default: .]
     """
     from drakegrasp.protocols.protocol import find_protocol
-    from drakegrasp.verification.result_files import refuse_unwritable
 
-    rule, stored = find_protocol(protocol)
-    if simulator not in (None, rule.simulator):
-        must = f"--simulator of protocol {stored} must be {rule.simulator}"
-        raise UsageError(f"{must}, got {simulator}")
-    with wrong_input():
-        if out is not None:
-            refuse_unwritable(out)
+    rule, _ = find_protocol(protocol)
     show, on = not (quiet or as_json), workers.asked()
     if rule.simulator != "drake":
         if on["scheduler"] or on["scheduler_file"]:
             raise UsageError(f"--scheduler must be left out with protocol {protocol}")
-        how: dict[str, Any] = {"workers": on["workers"], "show": show}
-        _by_protocol(grasps, target, protocol, out, as_json, assets, **how)
+        if out is not None:
+            raise UsageError(f"--out must be left out with protocol {protocol}, got {out}")
+        _by_protocol(grasps, target, protocol, assets, workers=on["workers"], show=show)
     elif assets is not None:
         raise UsageError("--assets must be used with another --protocol than lift")
     else:
-        _by_lift(grasps, target, out, as_json, show=show, **on)
+        _by_lift(grasps, target, out, lines=out is None or as_json, show=show, **on)
 
 
-def _by_lift(path: Path, target: Target, out: Path | None, echo: bool, **how: Any) -> None:
+def _by_lift(path: Path, target: Target, out: Path | None, *, lines: bool, **how: Any) -> None:
     """Write the verdicts of a lift, and print their counts."""
     from drakegrasp.api.verifying import run_verification
-    from drakegrasp.cli.tables import make_console, verdict_table
-    from drakegrasp.verification import result_files as files
-    from drakegrasp.verification.hints import count_hints
+    from drakegrasp.exchange.columns import HDF5_SUFFIXES
+    from drakegrasp.verification.result_files import json_line, refuse_unwritable, write_results
 
     # All input is read and checked before anything is simulated.
+    if out is not None:
+        if out.suffix.lower() not in HDF5_SUFFIXES:
+            raise UsageError(f"--out must be a file {' or '.join(HDF5_SUFFIXES)}, got {out}")
+        with wrong_input():
+            refuse_unwritable(out)
     grasps, config, rows = place(path, target)
 
     def deliver(index: int, result: Verification) -> None:
-        write(files.json_line(index, result))
+        if lines:
+            _write_line(json_line(index, result))
 
-    # Lines are written as verdicts arrive, so an interrupted run keeps the finished ones.
-    try:
-        with files.text_lines(out, echo=echo) as write:
-            results = run_verification(grasps, config, on_result=deliver, **how)
-            if out is not None:
-                files.write_results(results, files.result_paths(out)[1], config, rows)
-    except BaseException:
-        if out is not None and files.part_path(out).exists():
-            say(f"{files.part_path(out)}: the verdicts so far", err=True)
-        raise
+    results = run_verification(grasps, config, on_result=deliver, **how)
+    if out is not None:
+        write_results(results, out, config, rows)
+        if not lines:
+            say(str(out))
+    if how["show"]:
+        _say_counts(results)
 
-    for written in () if out is None or echo else files.result_paths(out):
-        say(str(written))
-    if not how["show"]:
-        return
-    total = f"of {len(results)} grasps"
-    make_console(stderr=True).print(verdict_table(results))
-    if best := [result.held for result in results if result.rank == 0]:
+
+def _write_line(line: str) -> None:
+    """Write a line of JSON, whose texts are escaped already."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def _say_counts(results: Sequence[Verification]) -> None:
+    """Print how many grasps have each outcome and verdict, and what would fit much better."""
+    total = f"of {counted(len(results), 'grasp')}"
+    for outcome, count in Counter(result.outcome.label for result in results).most_common():
+        say(f"{count:,} {total}: {outcome}", err=True)
+    words = ("held", "success", "precision", "stable", "sample", "held_any")
+    counts = (f"{sum(getattr(each, word) for each in results):,} {word}" for word in words)
+    say(f"verdicts: {', '.join(counts)}", err=True)
+    if best := [result.held for result in results if result.grasp.rank == 0]:
         say(f"{sum(best)} of {len(best)} best-ranked grasps hold", err=True)
-    for hint, count in count_hints(result.hints for result in results):
+    for hint, count in Counter(hint for each in results for hint in each.hints).most_common():
         say(f"{count} {total} would fit much better: {hint}", err=True)
     if lost := sum(result.misplaced and not result.hints for result in results):
         say(f"{lost} {total} are far from the object in every known frame and unit", err=True)
 
 
 def _by_protocol(
-    path: Path,
-    target: Target,
-    protocol: str,
-    out: Path | None,
-    echo: bool,
-    assets: Path | None,
-    **how: Any,
+    path: Path, target: Target, protocol: str, assets: Path | None, **how: Any
 ) -> None:
-    """Write the verdicts of a protocol of MuJoCo, and print how many grasps hold."""
+    """Print the verdicts of a protocol of MuJoCo, and how many grasps hold."""
     from drakegrasp.api.protocols import verify_by_protocol, verify_files_by_protocol
     from drakegrasp.protocols.postures import json_line
-    from drakegrasp.verification.result_files import result_paths, text_lines
 
     where, held = f"with protocol {protocol}", list[bool]()
-    target.refuse(where, "method", "snap_points", "rows", "config", "overrides", "link", "preshape")
+    target.refuse(where, "config", "overrides", "link", "preshape")
     files = _bench_files(path, target, where, assets)
 
     def deliver(index: int, result: PostureResult, trials: PostureTrials) -> None:
-        write(json_line(index, files[index] if files else path, result, trials))
+        _write_line(json_line(index, files[index] if files else path, result, trials))
         held.append(result[0].success)
 
-    with text_lines(out, echo=echo) as write:
-        if files:
-            how |= {"hand": Path(target.hand or ""), "objects": assets or Path()}
-            verify_files_by_protocol(files, protocol, deliver, **how)
-        else:
-            placed, config, _ = place(path, target)
-            grasps = sorted(placed, key=lambda grasp: grasp.index)
-            verify_by_protocol(grasps, config, protocol, deliver, **how)
-    if out is not None and not echo:
-        say(str(result_paths(out)[0]))
+    if files:
+        how |= {"hand": Path(target.hand or ""), "objects": assets or Path()}
+        verify_files_by_protocol(files, protocol, deliver, **how)
+    else:
+        placed, config, _ = place(path, target)
+        grasps = sorted(placed, key=lambda grasp: grasp.index)
+        verify_by_protocol(grasps, config, protocol, deliver, **how)
     if how["show"]:
         say(f"{sum(held):,} of {len(held):,} grasps hold by {protocol}", err=True)
 
@@ -266,28 +248,12 @@ def _bench_files(path: Path, target: Target, where: str, assets: Path | None) ->
             return []
     if not files:
         raise GraspError(f"{path}: must be a .npy file or a folder of them, got none")
-    names = ("mesh", "units", "dataset", "split", "frame", "camera")
+    names = ("mesh", "units", "dataset", "split", "frame")
     target.refuse(f"{where} and files of DexGraspBench", *names)
     if suffix != ".xml":
         must = "--hand must be an MJCF (.xml) with files of DexGraspBench"
         raise GraspError(f"{must}, got {target.hand}")
     return files
-
-
-class Read(NamedTuple):
-    """The grasps of a file, and what they are on.
-
-    Attributes:
-        table: The grasps.
-        on: A mesh, the rows of a dataset, or a dataset whose objects the grasps name.
-        config: The configuration that the caller gives; None for that of each object or row.
-        targets: (n,), the object or the row of each grasp.
-    """
-
-    table: Attempts | ContactRows
-    on: Path | dg.GraspDataset
-    config: Config | None
-    targets: Any
 
 
 def place(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config, PredictedRows | None]:
@@ -300,48 +266,25 @@ def place(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config, Predic
     Raises:
         GraspError, MeshError, ConfigError, HandError: If a file or an option cannot be used.
     """
-    from drakegrasp.api.verifying import place_grasps
-    from drakegrasp.dataset.reader import PredictedRows
     from drakegrasp.exchange.attempts import has_rows, holds_postures
-    from drakegrasp.exchange.columns import read_numbers
-    from drakegrasp.simulation.attempts import ranked
 
     with wrong_input():
-        postures = holds_postures(path)
+        postures, rows = holds_postures(path), None
         dataset = _dataset_of(path, target, postures)
         if dataset is None:
-            read = _of_mesh(path, target)
+            placed, config = _of_mesh(path, target)
         elif postures and target.split is None and not has_rows(path):
-            read = _of_objects(path, target, dataset)
+            placed, config = _of_objects(path, target, dataset)
         else:
-            read = _of_rows(path, target, dataset)
-        table, data = read.table, read.on if isinstance(read.on, dg.GraspDataset) else None
-        if table.confidence is not None:
-            table = ranked(table, read.targets)
-        placed, config = place_grasps(
-            table,
-            read.on,
-            None if data is None else read.targets,
-            frame=target.frame,
-            X_TC=None if target.camera is None else read_numbers(target.camera),
-            units=target.units,
-            hand=None if dataset is None else target.hand,
-            method=target.method,
-            snap_points=target.snap_points,
-            config=read.config,
-            overrides=target.overrides,
-        )
+            placed, config, rows = _of_rows(path, target, dataset)
         # Invalid contacts are failures of a network, but such postures belong elsewhere.
         if postures and all(grasp.invalid for grasp in placed):
             raise GraspError(f"{path}: {placed[0].invalid}")
-        _say_all(table.left_out)
-        if data is None:
-            return placed, config, None
-        return placed, config, PredictedRows.of(data.path, data.split, read.targets)
+        return placed, config, rows
 
 
-def _of_mesh(path: Path, target: Target) -> Read:
-    """Return the grasps of a file that belong to the mesh of --object, which they need not name.
+def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
+    """Return the grasps of a file on the mesh of --object, which they need not name.
 
     If all rows of a file name one other object, the file is used for this object.
 
@@ -351,6 +294,7 @@ def _of_mesh(path: Path, target: Target) -> Read:
     from drakegrasp.exchange.attempts import read_predictions
     from drakegrasp.objects.sources import find_mesh
     from drakegrasp.simulation.attempts import Attempts
+    from drakegrasp.verification.postures import place_on_object
 
     assert target.mesh is not None
     config = dg.load_config(target.config, target.overrides, **given(hand=target.hand))
@@ -359,54 +303,91 @@ def _of_mesh(path: Path, target: Target) -> Read:
     table = read_predictions(path, hand, of=name, split=target.split, read_as=target.read_as)
     if table.of_row is not None:
         raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
-    if not isinstance(table, Attempts):
-        return Read(table, target.mesh, config, [name] * len(table))
+    how: dict[str, Any] = {}
+    if isinstance(table, Attempts):
+        table = _of_object(table, name, path)
+        named = table.objects
+    else:
+        how["frame"] = target.frame or "object"
+        named = (name,) * len(table)
+    placed = dg.place_object(target.mesh, units=target.units, config=config)
+    ranked = _ranked(table, named)
+    return place_on_object(ranked, placed, overrides=target.overrides, **how), config
+
+
+def _of_object(table: Attempts, name: str, path: Path) -> Attempts:
+    """Return the postures of an object, which they name or not; see `_of_mesh`."""
     own = [i for i, each in enumerate(table.objects) if each in ("", name)]
     others = sorted(set(table.objects) - {"", name})
     if others and not all(table.invalid[i] for i in own):
         left = f"{len(table) - len(own):,} postures of {listed(others)} are left out"
         say(f"{path}: {left}, as --object is {name}", err=True)
-        table = table.at(own)
-    elif others and (path.is_dir() or len(others) > 1):
+        return table.at(own)
+    if others and (path.is_dir() or len(others) > 1):
         raise GraspError(f"{path}: postures must be of {name}, the --object, got {listed(others)}")
-    elif others:
+    if others:
         say(f"{path}: postures of {others[0]} are tried on {name}, the --object", err=True)
-    return Read(table, target.mesh, config, table.objects)
+    return table
 
 
-def _of_objects(path: Path, target: Target, dataset: Path) -> Read:
-    """Return the postures of a file that name objects of a dataset."""
+def _of_objects(path: Path, target: Target, dataset: Path) -> tuple[list[PlacedGrasp], Config]:
+    """Return the postures of a file on the objects of a dataset that they name."""
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.exchange.attempts import read_attempts
     from drakegrasp.hand.settings import override_config
-    from drakegrasp.simulation.attempts import Attempts
+    from drakegrasp.verification.postures import place_on_dataset
 
     out = dataset.parent if dataset.is_file() else dataset
     config = override_config(read_manifest(out).config, target.overrides)
     table = read_attempts(path, dg.load_hand(config.hand_source), read_as=target.read_as)
-    assert isinstance(table, Attempts)
-    return Read(table, out, None, table.objects)
+    own = config if target.overrides else None
+    table = _ranked(table, table.objects)
+    return place_on_dataset(table, out, own, overrides=target.overrides), config
 
 
-def _of_rows(path: Path, target: Target, dataset: Path) -> Read:
-    """Return the grasps of a file for rows of a dataset."""
+def _of_rows(
+    path: Path, target: Target, dataset: Path
+) -> tuple[list[PlacedGrasp], Config, PredictedRows]:
+    """Return the grasps of a file on the objects of rows of a dataset, and the rows."""
+    from drakegrasp.dataset.reader import PredictedRows
     from drakegrasp.exchange.attempts import read_predictions
-    from drakegrasp.verification.placing import choose_rows, dataset_config
+    from drakegrasp.verification.placing import dataset_config
+    from drakegrasp.verification.postures import place_on_rows
+    from drakegrasp.verification.prediction import choose_rows
 
     # For grasps from outside, only the objects and cameras of the rows are needed.
     split = target.split or DEFAULT_SPLIT
     data = dg.GraspDataset(dataset, split=split, fewer_fingers=dataset != path)
 
+    # A given configuration is used as it is; that of a dataset is combined with the rows' draws.
     own = None if target.config is None else dg.load_config(target.config, target.overrides)
-    config = dataset_config(data, own, target.hand, () if own else target.overrides)
-    hand = dg.load_hand(config.hand_source)
-    table = read_predictions(path, hand, of=data, read_as=target.read_as)
-    if table.of_row is not None:
-        target.refuse("with a file that has rows", "rows")
-    rows = table.of_row if target.rows is None else _read_rows(target.rows)
-    said = "`rows` in the file, or --rows, says for which rows they are"
-    rows = choose_rows(data, rows, len(table), said=said)
-    return Read(table, data, own, rows)
+    overrides = () if own else target.overrides
+    config = dataset_config(data, own, target.hand, overrides)
+    table = read_predictions(
+        path, dg.load_hand(config.hand_source), of=data, read_as=target.read_as
+    )
+    rows = choose_rows(
+        data, table.of_row, len(table), said="`rows` in the file says for which rows they are"
+    )
+    if table.left_out:
+        say(table.left_out, err=True)
+    placed = place_on_rows(
+        _ranked(table, rows),
+        data,
+        rows,
+        config=config,
+        drawn=own is None,
+        overrides=overrides,
+        frame=target.frame or "camera",
+    )
+    return placed, config, PredictedRows.of(data.path, data.split, rows)
+
+
+def _ranked(table: Rows, targets: Any) -> Rows:
+    """Return grasps, ranked among those of the same object or row if they state a confidence."""
+    from drakegrasp.simulation.attempts import ranked
+
+    return table if table.confidence is None else ranked(table, targets)
 
 
 def _dataset_of(path: Path, target: Target, postures: bool) -> Path | None:
@@ -428,43 +409,19 @@ def _dataset_of(path: Path, target: Target, postures: bool) -> Path | None:
             must = "--frame must be camera for a dataset's own grasps"
             raise GraspError(f"{must}, got {target.frame}")
 
-    # The camera of a posture is that of its row, and postures need no fit.
-    framed = target.mesh is not None and target.frame == "camera"
+    # The camera of a posture is that of its row.
     others = "" if postures else ", or grasps in an HDF5 file"
     for unused, where, *names in (
-        (postures, "with postures", "camera", "method", "snap_points", "rows"),
         (postures and target.frame == "camera", "with postures", "frame"),
         (postures and target.dataset, "with postures and --dataset", "units", "hand", "config"),
         (not postures, "without postures", "link", "preshape"),
         (target.mesh is None, "without --object", "units"),
-        (target.dataset is None, "without --dataset", "rows"),
         (target.dataset is None and not stored, f"without --dataset{others}", "split"),
-        (not framed, "without --object and --frame camera", "camera"),
     ):
         if unused:
             target.refuse(where, *names)
-    if framed and target.camera is None:
-        raise GraspError("--camera FILE must be given with --object and --frame camera, got none")
+    if target.mesh is not None and target.frame == "camera":
+        raise GraspError(
+            "--frame must not be camera with --object, got camera: its pose is unknown"
+        )
     return None if target.mesh is not None else target.dataset or path
-
-
-def _read_rows(text: str) -> Any:
-    """Return the rows that a text or a .npy file names; ranges include both ends."""
-    import numpy as np
-
-    from drakegrasp.exchange.columns import read_numbers
-
-    if text.endswith(".npy"):
-        rows = read_numbers(Path(text)).ravel()
-        if not (np.isfinite(rows).all() and (rows == np.floor(rows)).all()):
-            raise GraspError(f"{text}: must hold whole numbers, got others")
-        return rows.astype(np.int64)
-    if not ROWS.fullmatch(text):
-        raise GraspError(f"--rows must be as 0,4,7-9 or a .npy file, got {text[:40]!r}")
-    ends = [part.partition("-") for part in text.split(",")]
-    return [row for first, _, last in ends for row in range(int(first), int(last or first) + 1)]
-
-
-def _say_all(*texts: str) -> None:
-    for text in filter(None, texts):
-        say(text, err=True)

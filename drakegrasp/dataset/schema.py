@@ -585,12 +585,10 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 )
 
 #: A row per predicted grasp, in the order of the input, in `/grasps` of the results of
-#: `drakegrasp verify`. Values of a stage that was not reached, or that the method does not compute,
-#: are NaN, 0, false or empty. Palm, joints, contacts and lift are those of the first wrist pose.
+#: `drakegrasp verify`. Values of a stage that was not reached, or that a posture does not have, are
+#: NaN, 0, false or empty. Palm, joints, contacts and lift are those of the first wrist pose.
 VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "", "str", "-", "-", "name of the object", of="placed.model.name"),
-    Field("method", "", "str", "-", "-", "method of verification: hand, forces, or posture",
-          of="method"),
     _verdict("outcome", [outcome for outcome in Outcome if not outcome.dataset_only]),
     Field("success", "", "bool", "-", "-",
           "whether the first wrist pose holds, with each contact within verify.max_contact_error "
@@ -608,11 +606,12 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "whether any of the tried wrist poses holds: the choice of an oracle",
           of="held_any"),
     Field("confidence", "", "float64", "-", "-",
-          "confidence that the file of the grasps states; NaN if it states none", of="confidence",
+          "confidence that the file of the grasps states; NaN if it states none",
+          of="grasp.confidence",
           shown=Shown("confidence", digits=3)),
     Field("rank", "", "int64", "-", "-",
           "rank by confidence among the grasps for the same row, or without rows for the same "
-          "object; 0 for the best, -1 if the file states no confidence", of="rank"),
+          "object; 0 for the best, -1 if the file states no confidence", of="grasp.rank"),
     Field("reason", "", "str", "-", "-", "reason of the outcome, in words", of="reason"),
     Field("hints", "", "str", "-", "-",
           "changes with which a failed grasp would fit much better, in words", of="hint_text"),
@@ -628,9 +627,7 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("nhat_Q_O", "k 3", "float64", "-", "O", "outward unit normals of the tried grasp",
           of="nhat_Q_O"),
     Field("normalised", "", "bool", "-", "-",
-          "whether a predicted normal was not of unit length", of="normalised"),
-    Field("snapped", "", "bool", "-", "-",
-          "whether the predicted points were moved to the surface", of="snapped"),
+          "whether a predicted normal was not of unit length", of="grasp.normalised"),
     Field("surface_distance", "k", "float64", "m", "-",
           "distance of the predicted points from the object's surface", of="surface_distance",
           shown=Shown("requested to surface", "mm")),
@@ -638,10 +635,6 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "Ferrari-Canny measure of the predicted contacts, 0 without force closure",
           of="epsilon",
           shown=Shown("epsilon of the requested contacts", digits=3)),
-    Field("smallest_friction", "", "float64", "-", "-",
-          "smallest friction coefficient at which forces within the hand's limits at the "
-          "predicted contacts hold the object; inf if there is none", of="smallest_friction",
-          shown=Shown("least friction at the requested contacts", digits=2)),
     *_measured(
         "pregrasp",
         Field("X_OG", "12", "float64", "m, -", "O", "fitted or given pose of the palm"),
@@ -658,14 +651,9 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "angle between the fingertips' and the predicted normals at these positions",
           of="fit.normal_error",
           shown=Shown("requested normal to pad of the fit", "°")),
-    Field("solver_status", "", "int16", "-", "-",
-          "exit mode of SLSQP, 0 for success; -1 if SLSQP was not used", of="solver_status"),
-    Field("solver_iterations", "", "uint16", "-", "-", "iterations of SLSQP", of="fit.iterations"),
     Field("tries", "", "uint16", "-", "-", "number of wrist poses that were tried",
           of="num_tries",
           shown=Shown("wrist poses tried", digits=0)),
-    Field("closing_start", "k", "float64", "rad or m", "-",
-          "closing positions from which the simulated fingers close", of="closing_start"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
@@ -688,31 +676,6 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
               of="trial.lift.X_TO"),
         *_SLIP,
     ),
-    *_measured(
-        "forces",
-        Field("planned_force", "", "float64", "N", "-",
-              "method forces: normal force of the finger with the largest load relative to its "
-              "strength; inf if no forces can lift the object"),
-        Field("planned_share", "", "float64", "-", "-",
-              "method forces: smallest possible load of that finger, as a fraction of its "
-              "strength; above 1 the grasp fails"),
-    ),
-    Field("points_share", "", "float64", "-", "-",
-          "method forces: this fraction if each contact is a point", of="forces.points.share"),
-    Field("patches_share", "", "float64", "-", "-",
-          "method forces: this fraction if each contact is a patch", of="forces.patches.share"),
-    Field("selected_p_OQ", "k 3", "float64", "m", "O",
-          "method forces: points of the surface that the predicted contacts select",
-          of="forces.contacts.p_OQ"),
-    Field("selected_nhat_Q_O", "k 3", "float64", "-", "O",
-          "method forces: normals of the surface at the selected points",
-          of="forces.contacts.nhat_Q_O"),
-    Field("selected_distance", "k", "float64", "m", "-",
-          "method forces: distance of the predicted points from the selected ones",
-          of="forces.contacts.distance"),
-    Field("selected_angle", "k", "float64", "rad", "-",
-          "method forces: angle between predicted and selected normals",
-          of="forces.contacts.angle"),
 )
 
 #: Kinds of views in `/views` of scenes.hdf5.

@@ -45,11 +45,9 @@ from drakegrasp.simulation.attempts import (
     quaternion_poses,
     read_confidence,
     taken,
-    xyzw_poses,
 )
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.verification.placing import choose_rows, read_several
-from drakegrasp.verification.prediction import ContactRows, read_grasps
+from drakegrasp.verification.prediction import ContactRows, choose_rows, read_grasps, read_several
 
 #: Values that a file states once for all its rows.
 _OF_FILE = ("frame", "link", "joints", "hand", "gripper", "of_objects")
@@ -465,12 +463,11 @@ def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
     # The palm poses, in either form.
-    invalid = xyzw = None
+    invalid = None
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
     else:
-        place = arrays["position"], arrays["quaternion"]
-        (X_FG, invalid), xyzw = quaternion_poses(*place), xyzw_poses(*place)
+        X_FG, invalid = quaternion_poses(arrays["position"], arrays["quaternion"])
     numbers = {name: arrays[name] for name in _SCALARS if name in arrays}
     if "X_TO" in arrays:
         numbers["X_TO"] = _stacked(arrays["X_TO"], "X_TO")
@@ -479,7 +476,6 @@ def _of_arrays(arrays: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "objects": texts["object"] if "object" in texts else [""] * len(X_FG),
         "X_FG": X_FG,
-        "X_FG_xyzw": xyzw,
         "link": _link(texts.get("link")),
         "frame": _only(texts.get("frame"), "frame") or "object",
         **{name: arrays[name] for name in stages if name in arrays},

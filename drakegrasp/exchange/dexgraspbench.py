@@ -51,7 +51,7 @@ from drakegrasp.protocols.files import POSTURES, read_grasp_file
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.simulation.attempts import quaternion_poses, xyzw_poses
+from drakegrasp.simulation.attempts import quaternion_poses
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, joint_order
 from drakegrasp.verification.placing import PlacedGrasp
@@ -247,7 +247,6 @@ def read_dexgraspbench(path: Path, hand: Hand) -> dict[str, Any]:
     grasp, pose = stored.postures["grasp"], stored.object_pose
     X_WM, no_object = quaternion_poses(pose[:, :3], pose[:, 3:])
     X_WL, no_hand = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
-    xyzw = (xyzw_poses(rows[:, :3], rows[:, 3:7]) for rows in (pose, grasp))
     q = {f"q_{stage}": rows[:, 7:] for stage, rows in stored.postures.items()}
     numbers: dict[str, Any] = {"scale": stored.object_scale}
     count, trial = len(grasp), stored.trial_id
@@ -260,7 +259,6 @@ def read_dexgraspbench(path: Path, hand: Hand) -> dict[str, Any]:
     return {
         "objects": [PurePosixPath(stored.object_path).name] * count,
         "X_FG": multiply(invert_pose(X_WM), X_WL),
-        "X_FG_xyzw": multiply(invert_pose(next(xyzw)), next(xyzw)),
         "link": hand.palm_link,
         "frame": "object" if stored.exported else "mesh",
         **q,
@@ -354,7 +352,7 @@ def fitted_postures(
 
     For contacts it is the posture of the first wrist pose that fits them.
     """
-    contacts = [(i, g) for i, g in enumerate(grasps) if not g.invalid and g.method != "posture"]
+    contacts = [(i, g) for i, g in enumerate(grasps) if not (g.invalid or g.postures)]
     fitted = dict(execute(_fit, contacts))
 
     def posture_of(i: int, grasp: PlacedGrasp) -> Posture | str:

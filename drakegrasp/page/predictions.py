@@ -60,7 +60,7 @@ QUANTITIES = {
     "true_error": Shown("requested to true", "mm"),
     **{
         name: NUMBERS[name]
-        for name in ("surface_distance", "slip", "turn", "confidence", "smallest_friction")
+        for name in ("surface_distance", "slip", "turn", "confidence", "epsilon")
     },
 }
 #: Quantities on cards.

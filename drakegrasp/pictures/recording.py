@@ -27,7 +27,7 @@ from drakegrasp.pictures.style import PREDICTED
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
+from drakegrasp.simulation.construction import MESHCAT_RATE, build_object_scene, build_scene
 from drakegrasp.simulation.scene import ObjectScene, Scene, reset_attempt, reset_object
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
@@ -118,6 +118,18 @@ def show_start(
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
     reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing, q=q)
     _aim_camera(meshcat, scene, X_WO, config, side_W=X_WO[:3, :3] @ X_OG[:3, 3])
+
+
+def record_object(
+    model: ObjectModel, X_TO: npt.ArrayLike, config: Config, path: Path, *, caption: str = ""
+) -> None:
+    """Write a recording of an object at rest; see `record_attempt`."""
+
+    def run(meshcat: Meshcat) -> None:
+        scene = build_object_scene(model, config.physics, meshcat=meshcat)
+        show_object(meshcat, scene, X_TO, config)
+
+    record_html(run, path, caption)
 
 
 def show_object(meshcat: Meshcat, scene: ObjectScene, X_TO: npt.ArrayLike, config: Config) -> None:

@@ -28,7 +28,8 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
 from drakegrasp.simulation.attempts import EACH, Attempts, GraspRows, Rows, ranked
-from drakegrasp.verification.placing import PlacedGrasp, dataset_config, read_several
+from drakegrasp.verification.placing import PlacedGrasp, dataset_config
+from drakegrasp.verification.prediction import read_several
 from drakegrasp.verification.result import Verification
 
 
@@ -180,7 +181,7 @@ def verdict_of(result: Verification) -> Verdict:
     """Return the part of a verification that a score stores."""
     first, farthest, p_OQ = result.first, result.farthest_contact, result.p_OQ
     closed = None if first is None else first.trial.closed
-    if result.method == "posture" and closed is not None:
+    if result.grasp.postures and closed is not None:
         farthest, p_OQ = (0.0 if result.held else math.nan), closed.contacts.p_OQ
     return Verdict(
         outcome=result.outcome.label,

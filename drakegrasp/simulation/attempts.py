@@ -63,7 +63,7 @@ _DECIDING = (
     *("scale", "preshape", "row"),
 )
 #: Attributes of a table that apply to all its rows together.
-_OF_ALL = ("frame", "link", "file", "sha256", "without_rows")
+_OF_ALL = ("frame", "file", "sha256", "without_rows")
 #: Conditions that an attempt may have drawn, in the order of `Attempts.conditions`.
 CONDITIONS = ("friction_hand", "friction_table", "mass")
 
@@ -147,9 +147,6 @@ class Attempts(GraspRows):
         preshape: (n,), name of the hand's preshape; empty if all fingers close; or `EACH`.
         conditions: (n, 3), the `CONDITIONS` under which the grasp held; NaN if unknown.
             Verification uses them; a build draws its own conditions.
-        link: Frame that the file gives poses of instead of the palm frame, shown in hints: the palm
-            link or a frame of another tool; empty for the palm frame.
-        X_FG_xyzw: (n, 4, 4), for hints: X_FG read with the quaternions in the order x, y, z, w.
     """
 
     objects: tuple[str, ...]
@@ -165,8 +162,6 @@ class Attempts(GraspRows):
     said: tuple[str, ...]
     preshape: tuple[str, ...]
     conditions: Array
-    link: str = ""
-    X_FG_xyzw: Array | None = None
 
     def of_object(self, name: str) -> Attempts:
         """Return the valid rows of an object, in their order."""
@@ -289,7 +284,6 @@ def make_attempts(
     conditions: npt.ArrayLike | None = None,
     of_row: Any = None,
     confidence: Any = None,
-    X_FG_xyzw: Array | None = None,
     alone: npt.ArrayLike = False,
 ) -> Attempts:
     """Return a table of postures, after checking each row separately.
@@ -318,7 +312,6 @@ def make_attempts(
         conditions: (n, 3), `CONDITIONS`; NaN for those of the object and of the configuration.
         of_row: (n,), see `Attempts`.
         confidence: (n,), see `Attempts`.
-        X_FG_xyzw: (n, 4, 4), X_FG read with the quaternions in the order x, y, z, w.
         alone: (n,), whether a row is a palm pose alone, without joints at any stage.
 
     Raises:
@@ -346,7 +339,6 @@ def make_attempts(
     pregrasp, squeeze = _beside_grasp(q, palms, size, bad)
     if link is not None:
         X_FG = multiply(np.asarray(X_FG), X_AG)
-        X_FG_xyzw = None if X_FG_xyzw is None else multiply(X_FG_xyzw, X_AG)
     return Attempts(
         objects=tuple(objects),
         X_FG=_poses(X_FG, count, "the palm's pose", bad),
@@ -365,8 +357,6 @@ def make_attempts(
         invalid=tuple(bad),
         of_row=of_row,
         confidence=None if confidence is None else read_confidence(confidence, (count,), bad),
-        link=link or "",
-        X_FG_xyzw=X_FG_xyzw,
     )
 
 
@@ -666,11 +656,6 @@ def quaternion_poses(
         R = Rotation.from_quat(wxyz[good] / length[good, None], scalar_first=True).as_matrix()
         X[good] = [make_pose(*each) for each in zip(R, p[good], strict=True)]
     return X, reasons
-
-
-def xyzw_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Array:
-    """Return the poses (n, 4, 4) of `quaternion_poses` if the numbers had the order x, y, z, w."""
-    return quaternion_poses(positions, np.roll(np.asarray(quaternions), 1, axis=1))[0]
 
 
 def _poses(

@@ -29,7 +29,6 @@ from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
 from drakegrasp.hand.finger_sweep import pad_points
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import copy_materials
 from drakegrasp.simulation.contacts import (
     Contacts,
@@ -51,7 +50,6 @@ from drakegrasp.simulation.scene import (
     transfer_state,
 )
 from drakegrasp.simulation.screen import extra_margin
-from drakegrasp.simulation.settle import GRAVITY
 from drakegrasp.simulation.verdict import is_lost_sample
 
 #: An object that moved less than this in the hand since the last check is still held [m], [rad].
@@ -313,25 +311,6 @@ class LiftPath:
             shift * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
             shift * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
         )
-
-    def wrenches(self, model: ObjectModel) -> Array:
-        """Return the wrenches (2, 6) at the two peaks of acceleration, about Ocm in {O}.
-
-        Each is [torque; force] on the object [N m, N]. The orientation is constant, so there is no
-        torque, and every wrench of the motion lies between these two, which are
-
-            w = [0; m R_OW (g ẑ ± a_max)],   a_max = 10/√3 d / T².
-        """
-        shift = self.p_WO_end - self.X_WO[:3, 3]
-        peak = PEAK_ACCELERATION * shift / self.duration**2
-        forces_W = [carrying_force(model, peak), carrying_force(model, -peak)]
-        return np.hstack([np.zeros((2, 3)), forces_W @ self.R_WO])
-
-
-def carrying_force(model: ObjectModel, acceleration: npt.ArrayLike) -> Array:
-    """Return the force (3,) in {W} [N] that gives a free object an acceleration (3,) [m/s^2]."""
-    against_gravity = np.array([0.0, 0.0, GRAVITY])
-    return model.mass * (np.asarray(acceleration, dtype=float) + against_gravity)
 
 
 def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:

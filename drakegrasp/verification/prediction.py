@@ -7,16 +7,21 @@ grasps at all is an error, with a message of one line.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import LARGEST
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import FARTHEST, Array, Frame, as_numbers, without_torch
-from drakegrasp.simulation.attempts import GraspRows
+from drakegrasp.frames import FARTHEST, Array, Frame, as_numbers
+from drakegrasp.simulation.attempts import GraspRows, read_confidence
+
+#: The row of a split for each of n grasps, or one row for all; None for all rows, in order.
+RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
 
 #: Frames of predicted contacts.
 FRAMES = (Frame.OBJECT, Frame.CAMERA, Frame.TABLE, Frame.MESH)
@@ -57,8 +62,7 @@ def read_grasps(
     """Return the grasps of grasp vectors (n, 6k); a bad row does not affect other rows.
 
     Args:
-        grasps: (n, 6k), or (6k,) for one grasp: k points [m], then k outward normals. In a list of
-            rows, rows of another length and rows that are not numbers are invalid rows.
+        grasps: (n, 6k), or (6k,) for one grasp: k points [m], then k outward normals.
         fingers: Number of fingers, k.
         rows: (n,), row of a split that each grasp is for.
         confidence: (n,), greater is better.
@@ -68,7 +72,14 @@ def read_grasps(
     """
     # Each valid row has 6k numbers.
     size = 6 * fingers
-    array, invalid = _read_rows(grasps, size, fingers)
+    array = as_numbers(grasps, f"a grasp must be {size} numbers")
+    if array.ndim not in (1, 2) or array.shape[-1] != size:
+        raise GraspError(
+            f"a grasp must be {size} numbers ({fingers} points, then {fingers} outward normals), "
+            f"got an array of shape {array.shape}"
+        )
+    array = np.atleast_2d(array)
+    invalid = [""] * len(array)
 
     # Reject numbers that no contact has.
     limit = np.r_[np.full(size // 2, FARTHEST), np.full(size // 2, LARGEST)]
@@ -100,36 +111,75 @@ def read_grasps(
     )
 
 
-def _read_rows(grasps: npt.ArrayLike, size: int, fingers: int) -> tuple[Array, list[str]]:
-    """Return rows (n, 6k), NaN for rows of another length, and the reasons."""
-    # Rows of different lengths come as a list, or as an array of objects.
-    rows = without_torch(grasps)
-    rows = rows if isinstance(rows, list) else np.asarray(rows)
-    if isinstance(rows, list) or (rows.dtype == object and rows.ndim == 1):
-        shapes = [_shape(row) for row in rows]
-        if len(set(shapes)) > 1 and any(shapes):
-            array, invalid = np.full((len(rows), size), np.nan), [""] * len(rows)
-            for i, (row, shape) in enumerate(zip(rows, shapes, strict=True)):
-                if shape == (size,):
-                    array[i] = as_numbers(row, f"a grasp must be {size} numbers")
-                else:
-                    numbers = 0 if shape is None else int(np.prod(shape))
-                    invalid[i] = f"the row has {numbers} numbers, not {size}"
-            return array, invalid
+def choose_rows(
+    dataset: GraspDataset,
+    rows: RowChoice,
+    count: int,
+    *,
+    said: str = "`rows` says for which rows they are",
+) -> npt.NDArray[np.int64]:
+    """Return the row (n,) of the dataset's split for each of `count` grasps; one may be for all.
 
-    array = as_numbers(grasps, f"a grasp must be {size} numbers")
-    if array.ndim not in (1, 2) or array.shape[-1] != size:
+    `said` is the part of the error message that explains how to give rows.
+
+    Raises:
+        GraspError: If there is not exactly one row per grasp, or a row does not exist.
+    """
+    chosen = np.arange(count) if rows is None else np.asarray(rows)
+    # NumPy treats an empty list as real numbers.
+    if chosen.size and chosen.dtype.kind not in "iu":
+        raise GraspError(f"rows must be whole numbers, got values of type {chosen.dtype}")
+    chosen = chosen.astype(np.int64)
+    chosen = np.full(count, chosen) if chosen.ndim == 0 else chosen.ravel()
+
+    # Check that there is one row per grasp.
+    if len(chosen) != count:
+        raise GraspError(f"rows must be one per grasp ({count}), got {len(chosen)}")
+    if not len(dataset):
+        raise GraspError(f"{dataset.path}: {dataset.emptiness}")
+    if rows is None and count != len(dataset):
         raise GraspError(
-            f"a grasp must be {size} numbers ({fingers} points, then {fingers} outward normals), "
-            f"got an array of shape {array.shape}"
+            f"without rows there must be a grasp for each of the {len(dataset)} rows of "
+            f"{dataset.split} in {dataset.path.name}, got {count} grasps ({said})"
         )
-    array = np.atleast_2d(array)
-    return array, [""] * len(array)
+
+    # Check that the rows exist.
+    wrong = chosen[(chosen < 0) | (chosen >= len(dataset))]
+    if len(wrong):
+        raise GraspError(
+            f"rows must be 0 to {len(dataset) - 1} of {dataset.split} in {dataset.path.name}, "
+            f"got {wrong[0]}"
+        )
+    return chosen
 
 
-def _shape(row: Any) -> tuple[int, ...] | None:
-    """Return the shape of a row of numbers, () for a single number; None for no numbers."""
-    try:
-        return as_numbers(row, "").shape
-    except GraspError:
-        return None
+def read_several(
+    grasps: npt.ArrayLike,
+    data: GraspDataset,
+    *,
+    fingers: int,
+    rows: RowChoice = None,
+    confidence: npt.ArrayLike | None = None,
+) -> ContactRows:
+    """Return predicted contacts for rows of a split; a row may have several predictions.
+
+    Args:
+        grasps: (n, 6k), or (n, m, 6k) with m grasps per row. NaN is kept: it is a bad prediction,
+            not a mistake of the caller.
+        data: The split.
+        fingers: Number of fingers, k.
+        rows: (n,), row that each prediction is for, with repeats; None for all rows in order.
+        confidence: (n,) or (n, m), greater is better.
+
+    Raises:
+        GraspError: If the shapes do not match, or a row does not exist.
+    """
+    array = as_numbers(grasps, "grasps must be numbers")
+    if array.ndim not in (2, 3) or array.size == 0:
+        raise GraspError(f"grasps must be (n, 6k), or (n, m, 6k) for m per row, got {array.shape}")
+    of_row = np.repeat(choose_rows(data, rows, len(array)), array[0, ..., 0].size)
+    stated = None
+    if confidence is not None:
+        stated = read_confidence(confidence, array.shape[:-1]).ravel()
+    flat = array.reshape(-1, array.shape[-1])
+    return read_grasps(flat, fingers, rows=of_row, confidence=stated)

@@ -1,9 +1,8 @@
 """The result of verifying one grasp: the verdict, what was simulated, and why, in sentences.
 
 Input: what `verify` measured. Output: a `Verification` and its explanation. The explanation states
-whether the grasp holds and why, what moved, how close the contacts are to the requested ones, and
-what forces at the contacts alone can do. Numbers in another frame or unit, or normals that point
-inwards, are reported first.
+whether the grasp holds and why, what moved, and how close the contacts are to the requested ones.
+If the points are off the object, this is reported first.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -21,29 +20,17 @@ from drakegrasp.config import Config
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.generation.attempts import unjudged
-from drakegrasp.grasp import for_all_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.verification.forces import ForceVerdict, force_margin
-from drakegrasp.verification.hints import (
-    FAR,
-    FAR_POSTURE,
-    Reading,
-    contact_readings,
-    posture_readings,
-)
+from drakegrasp.verification.hints import FAR, find_hints
+from drakegrasp.verification.margin import contact_epsilon
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.wrist_solver import WristFit
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,62 +62,39 @@ class PoseTrial:
         return self.trial.outcome is Outcome.SUCCESS
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Findings:
-    """What was found about a grasp: a verdict without the grasp and the object's meshes.
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Verification:
+    """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
+
+    The grasp is judged by its first wrist pose, which fits the contacts best. Epsilon and hints are
+    computed when they are asked for.
 
     Attributes:
-        outcome: Outcome of the trial of the first wrist pose, as in a dataset; or `invalid`; or
-            `off_surface` with method `forces`.
+        grasp: The grasp on its object, as it was requested.
+        outcome: Outcome of the trial of the first wrist pose, as in a dataset; or `invalid`.
         reason: Reason for the outcome, in one sentence without a full stop.
         p_OQ, nhat_Q_O: (k, 3), the contact points [m] and unit normals in {O} that were tried; NaN
             for an invalid row or a posture.
         surface_distance: (k,), distances of the predicted points from the object's surface [m].
-        posture: The posture that was tried, in {O}; None for contacts.
-        tries: The wrist poses that were simulated, in order.
-        forces: What forces at the contacts alone can do, with method `forces`.
+        tries: The wrist poses that were simulated, in order; none for an invalid row.
         seconds: Wall-clock time by stage [s].
         stand: Index of the resting pose of this verdict: the best of those in which a posture was
             tried.
-        margin: Epsilon and smallest friction, if they were computed already.
-        doubts: Readings and fingertip distances, if they were computed already.
+        margin: Epsilon, if it was computed already.
+        told: The hints, if they were found already.
     """
 
+    grasp: PlacedGrasp
     outcome: Outcome
     reason: str
     p_OQ: Array
     nhat_Q_O: Array
     surface_distance: Array
-    posture: Posture | None = None
     tries: tuple[PoseTrial, ...] = ()
-    forces: ForceVerdict | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     stand: int = 0
-    margin: tuple[float, float] | None = None
-    doubts: tuple[tuple[Reading, ...], Array | None] | None = None
-
-    def of(self, grasp: PlacedGrasp) -> Verification:
-        """Return the verdict on the grasp that this was found about."""
-        return Verification(grasp=grasp, **{f.name: getattr(self, f.name) for f in fields(self)})
-
-
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Verification(Findings):
-    """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
-
-    The grasp is judged by its first wrist pose, which fits the contacts best. Margins and hints are
-    computed when they are asked for.
-
-    Attributes:
-        grasp: The grasp on its object, as it was requested.
-    """
-
-    grasp: PlacedGrasp
-
-    @property
-    def method(self) -> str:
-        """The way of verification: "hand", "forces" or "posture"."""
-        return self.grasp.method
+    margin: float | None = None
+    told: tuple[str, ...] | None = None
 
     @property
     def placed(self) -> PlacedObject:
@@ -142,96 +106,14 @@ class Verification(Findings):
         """Hand, physics, lift and rules of the verification."""
         return self.grasp.config
 
-    @property
-    def normalised(self) -> bool:
-        """Whether a predicted normal was not of unit length, and was normalised."""
-        return self.grasp.normalised
-
-    @property
-    def snapped(self) -> bool:
-        """Whether the points were moved to the closest points of the surface."""
-        return self.grasp.snap_points and not self.grasp.invalid
-
-    @property
-    def confidence(self) -> float:
-        """Confidence of the grasp in the caller's file; NaN if the file has none."""
-        return self.grasp.confidence
-
-    @property
-    def rank(self) -> int:
-        """Rank by confidence among the grasps for the same row, or of the same object.
-
-        It is 0 for the best, -1 without confidence.
-        """
-        return self.grasp.rank
-
-    @property
-    def epsilon(self) -> float:
-        """Ferrari-Canny measure of the contacts; 0 without force closure."""
-        return self._margin[0]
-
-    @property
-    def smallest_friction(self) -> float:
-        """Smallest friction coefficient at which forces hold the object at the contacts.
-
-        The forces are within the hand's limit; it is inf if no coefficient suffices.
-        """
-        return self._margin[1]
-
-    @cached_property
-    @one_thread
-    def _margin(self) -> tuple[float, float]:
-        if self.margin is not None:
-            return self.margin
-        if self.posture is not None or self.grasp.invalid:
-            return np.nan, np.nan
-        with timed(self.seconds, "margin"):
-            X_TO = self.placed.X_TO_simulated
-            return force_margin(self.placed.model, X_TO, self.p_OQ, self.nhat_Q_O, self.config)
-
-    @property
-    def hints(self) -> tuple[str, ...]:
-        """Readings in which a grasp that fails would fit much better, in words."""
-        return tuple(reading.text for reading in self._doubts[0])
-
-    @property
-    def fingertip_distance(self) -> Array | None:
-        """For a posture that fails, distances of its grasp's fingertips from the surface [m].
-
-        There is one per finger that the posture closes; it is None for all other grasps.
-        """
-        return None if self.posture is None else self._doubts[1]
-
-    @cached_property
-    @one_thread
-    def _doubts(self) -> tuple[tuple[Reading, ...], Array | None]:
-        """Readings that fit much better, and the distances of a posture's fingertips."""
-        if self.doubts is not None:
-            return self.doubts
-        fits = self.held if self.posture else self.success and not self.misplaced
-        if fits or self.grasp.invalid or self.outcome.inconclusive:
-            return (), None
-        with timed(self.seconds, "hints"):
-            if self.posture is not None:
-                return posture_readings(self.grasp, self.placed, self.posture)
-            return contact_readings(self.grasp, self.nhat_Q_O, fits=self.success), None
-
-    def explained(self) -> Findings:
-        """Return what was found, with margins and hints, which are computed now."""
-        return replace(self, margin=self._margin, doubts=self._doubts).findings
-
-    @property
-    def findings(self) -> Findings:
-        """What was found, without the grasp."""
-        return Findings(**{f.name: getattr(self, f.name) for f in fields(Findings)})
+    # How well it holds
 
     @property
     def success(self) -> bool:
         """Whether the first wrist pose holds, with every contact where it was requested.
 
-        "Where it was requested" means within `verify.max_contact_error`. With method `forces`, it
-        is whether forces hold the object. A posture requests no contacts, so it is whether it
-        holds.
+        "Where it was requested" means within `verify.max_contact_error`. A posture requests no
+        contacts, so it is whether it holds.
         """
         return self.held and not self.farthest_contact > self.config.verify.max_contact_error
 
@@ -255,28 +137,13 @@ class Verification(Findings):
         return next((i for i, each in enumerate(self.tries) if each.held), None)
 
     @property
-    def misplaced(self) -> bool:
-        """Whether a contact is more than 10 mm off the surface: frame or unit may be wrong.
-
-        A posture that fails is misplaced if all its fingertips are more than 10 mm off and there
-        are hints, or if all are more than 50 mm off.
-        """
-        if self.fingertip_distance is not None:
-            limit = FAR if self.hints else FAR_POSTURE
-            return bool(self.fingertip_distance.size and self.fingertip_distance.min() > limit)
-        return bool(np.any(self.surface_distance > FAR))
-
-    @property
     def precision(self) -> bool:
         """Whether the object is held, and only by the fingertips."""
         return self.held and (self.trial is None or self.trial.precision)
 
     @property
     def stable(self) -> bool:
-        """Whether it is a precision grasp that moves less than 5 mm and 5 degrees in the hand.
-
-        With method `forces` nothing moves, so a grasp that holds is stable.
-        """
+        """Whether it is a precision grasp that moves less than 5 mm and 5 degrees in the hand."""
         return self.held and (self.trial is None or self.trial.stable)
 
     @property
@@ -294,24 +161,12 @@ class Verification(Findings):
         """Filters that a verdict cannot judge, e.g. those of images."""
         return unjudged(self.config.filters)
 
-    @property
-    def words(self) -> str:
-        """The verdict in words: "held", "precision", "stable", "sample", or the failure."""
-        if not self.held:
-            return f"fails: {self.outcome.label.replace('_', ' ')}"
-        names = ("held", "precision", "stable", "sample")
-        words = [name for name in names if getattr(self, name)]
-        return ", ".join([*words, *([] if self.success else ["not as requested"])])
+    # The first wrist pose
 
     @property
     def first(self) -> PoseTrial | None:
-        """The first wrist pose and its trial; None with method `forces` or an invalid row."""
+        """The first wrist pose and its trial; None for an invalid row."""
         return self.tries[0] if self.tries else None
-
-    @property
-    def num_tries(self) -> int:
-        """Number of wrist poses that were simulated."""
-        return len(self.tries)
 
     @property
     def fit(self) -> WristFit | None:
@@ -322,14 +177,6 @@ class Verification(Findings):
     def pregrasp(self) -> Attempt | None:
         """Palm and opened fingers at the start of the first trial."""
         return self.first.pregrasp if self.first else None
-
-    @property
-    def closing_start(self) -> Array | None:
-        """(k,), initial closing positions; NaN for fingers that a preshape leaves out."""
-        start = self.pregrasp
-        if start is None or start.closing is None:
-            return None
-        return for_all_fingers(start.closing, start.unused, len(self.p_OQ))
 
     @property
     def trial(self) -> TrialRecord | None:
@@ -353,34 +200,66 @@ class Verification(Findings):
         A curve over d of the fraction of grasps that hold within d counts the `held` grasps with a
         smaller value than d.
         """
-        return _largest(self.contact_error)
+        errors = np.zeros(0) if self.contact_error is None else self.contact_error
+        known = errors[np.isfinite(errors)]
+        return float(known.max()) if known.size else np.nan
 
     @property
-    def closed(self) -> Contacts | None:
-        """Contacts after closing; `trial.closed` also has the joint positions at that time."""
-        end = None if self.trial is None else self.trial.closed
-        return None if end is None else end.contacts
+    def num_tries(self) -> int:
+        """Number of wrist poses that were simulated."""
+        return len(self.tries)
+
+    # Margins and hints
+
+    @cached_property
+    @one_thread
+    def epsilon(self) -> float:
+        """Ferrari-Canny measure of the contacts; 0 without force closure, NaN for a posture."""
+        if self.margin is not None:
+            return self.margin
+        if self.grasp.postures or self.grasp.invalid:
+            return np.nan
+        with timed(self.seconds, "margin"):
+            about = self.placed.model, self.p_OQ, self.nhat_Q_O
+            return contact_epsilon(*about, self.config.physics)
 
     @property
-    def lifted(self) -> Contacts | None:
-        """Contacts after the lift; `trial.lift` also has joints, poses, slip and turn then."""
-        end = None if self.trial is None else self.trial.lift
-        return None if end is None else end.contacts
+    def misplaced(self) -> bool:
+        """Whether a contact is more than 10 mm off the surface: frame or unit may be wrong."""
+        return bool(np.any(self.surface_distance > FAR))
 
-    @property
-    def solver_status(self) -> int:
-        """Exit mode of SLSQP, 0 for success; -1 if it was not used."""
-        return -1 if self.fit is None else self.fit.status
+    @cached_property
+    @one_thread
+    def hints(self) -> tuple[str, ...]:
+        """Readings in which contacts that fail would fit much better, in words."""
+        if self.told is not None:
+            return self.told
+        fits = self.success and not self.misplaced
+        if fits or self.grasp.postures or self.grasp.invalid or self.outcome.inconclusive:
+            return ()
+        with timed(self.seconds, "hints"):
+            return find_hints(self.grasp, self.nhat_Q_O, fits=self.success)
 
     @property
     def hint_text(self) -> str:
         """The hints in a line; empty if there are none."""
         return "; ".join(self.hints)
 
+    def explained(self) -> Verification:
+        """Return the verdict with margins and hints, which are computed now."""
+        return replace(self, margin=self.epsilon, told=self.hints)
+
+    def findings(self) -> dict[str, Any]:
+        """Return the attributes without the grasp, whose meshes are large."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "grasp"}
+
+    # For people
+
     def save_html(self, path: str | Path) -> None:
         """Write an HTML file that plays the simulation in a browser, from any side.
 
-        The grasp is simulated again for the file, which gives the same bits.
+        The grasp is simulated again for the file, which gives the same bits. For an invalid row,
+        the file shows the object at rest.
 
         Args:
             path: The file to write.
@@ -388,55 +267,54 @@ class Verification(Findings):
         Raises:
             OSError: If the file cannot be written.
         """
-        from drakegrasp.verification.figure import record_verification
+        from drakegrasp.pictures.recording import record_attempt, record_object
 
-        record_verification(self, Path(path))
-
-    def figure(self) -> Figure:
-        """Return a matplotlib figure of predicted and reached contacts on the mesh."""
-        from drakegrasp.verification.figure import verification_figure
-
-        return verification_figure(self)
+        about = self.placed.model, self.placed.X_TO_simulated
+        if self.pregrasp is None:
+            record_object(*about, self.config, Path(path), caption=self.explain())
+            return
+        record_attempt(
+            *about,
+            self.pregrasp,
+            self.config,
+            Path(path),
+            p_OQ=self.p_OQ,
+            nhat_Q_O=self.nhat_Q_O,
+            caption=self.explain(),
+        )
 
     def explain(self) -> str:
         """Return the verdict and its reason in a few sentences."""
         return " ".join(_sentences(self))
 
     def __repr__(self) -> str:
-        return f"Verification({self.method}, {self.words}: {self.reason})"
-
-
-def _largest(values: Array | None) -> float:
-    """Return the largest finite number, NaN if there is none."""
-    there = np.zeros(0) if values is None else values[np.isfinite(values)]
-    return float(there.max()) if there.size else np.nan
+        return f"Verification({self.outcome.label}: {self.reason})"
 
 
 def _sentences(verified: Verification) -> Iterator[str]:
-    # Faults in the numbers come first: if there are any, all else is about another grasp.
-    inwards = any(reading.reversed for reading in verified._doubts[0])
+    # Points off the object come first: then all else is about another grasp.
+    better = f"This would fit much better: {verified.hint_text}."
     if verified.misplaced:
-        yield from _misplaced(verified)
-    elif inwards:
-        yield (
-            "The normals point into the object; a grasp has normals that point out of it. This "
-            f"would fit much better: {verified.hint_text}."
-        )
+        yield _misplaced(verified)
+        if verified.hints:
+            yield better
+        elif (verified.surface_distance > FAR).all():
+            yield (
+                "They fit in no other known frame or unit. Are they in the frame of a camera whose "
+                "pose is not given, or do they belong to another object?"
+            )
 
     # The verdict, and the changes to the row of numbers.
     verdict = "holds" if verified.held else f"fails ({verified.outcome.label})"
     yield f"The grasp of {verified.placed.model.name} {verdict}: {verified.reason}."
     if verified.outcome is Outcome.INVALID:
         return
-    if verified.normalised:
+    if verified.grasp.normalised:
         yield "A predicted normal was not of unit length; it was normalised."
-    if verified.snapped:
-        moved = in_mm(verified.surface_distance.max())
-        yield f"The points were moved to the surface, by at most {moved}."
 
     # What the hand did, with the first wrist pose and with the others.
     if verified.fit is not None:
-        yield from _contacts(verified)
+        yield from _contacts(verified, verified.fit)
     if verified.num_tries > 1:
         yield _other_poses(verified)
     if verified.trial is not None and verified.trial.lift is not None:
@@ -447,49 +325,33 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _as_a_sample(verified, verified.removal)
         yield from _loads(verified)
 
-    # What forces at the contacts alone can do, and other possible faults in the numbers.
-    if not np.isnan(verified.smallest_friction):
-        yield _margin(verified)
-    if verified.hints and not inwards:
-        yield f"This would fit much better: {verified.hint_text}."
-
-
-def _misplaced(verified: Verification) -> Iterator[str]:
-    """Yield how far the contacts or the posture are off the object, and where they would fit."""
-    # State what is off and how far.
-    distance = verified.surface_distance
-    all_far = bool(np.all(distance > FAR))
-    more = ", so the requested grasp does not touch it"
-    if verified.fingertip_distance is not None:
-        distance, all_far = verified.fingertip_distance, True
-        what, more = "The posture's fingertips are", ""
-    elif all_far:
-        what = "The points lie"
-    else:
-        far = int(np.sum(distance > FAR))
-        what = f"{far} of {len(distance)} points {'lies' if far == 1 else 'lie'}"
-        distance, more = distance[distance > FAR], f"{more} there"
-    between = in_mm(distance.max())
-    if len(distance) > 1 and in_mm(distance.min()) != between:
-        between = f"{1e3 * distance.min():.1f} to {between}"
-    yield f"{what} {between} off the object{more}."
-
-    # State where it would fit. If some points are near, the frame is hardly wrong.
+    # Other possible faults in the numbers.
     if verified.hints:
-        yield f"This would fit much better: {verified.hint_text}."
-    elif all_far:
-        yield (
-            "They fit in no other known frame or unit. Are they in the frame of a camera whose "
-            "pose is not given, or do they belong to another object?"
+        yield better
+
+
+def _misplaced(verified: Verification) -> str:
+    """Return how far the contacts are off the object."""
+    distance, there = verified.surface_distance, ""
+    far = distance[distance > FAR]
+    what = "The points lie"
+    if len(far) < len(distance):
+        what, there = (
+            f"{len(far)} of {len(distance)} points {'lies' if len(far) == 1 else 'lie'}",
+            " there",
         )
+    between = in_mm(far.max())
+    if in_mm(far.min()) != between:
+        between = f"{1e3 * far.min():.1f} to {between}"
+    return f"{what} {between} off the object, so the requested grasp does not touch it{there}."
 
 
-def _contacts(verified: Verification) -> Iterator[str]:
+def _contacts(verified: Verification, fit: WristFit) -> Iterator[str]:
     """Yield how well the hand makes the requested contacts."""
     # Before closing, according to the fit.
-    fit, limit = verified.fit, verified.config.verify.max_contact_error
+    limit = verified.config.verify.max_contact_error
     errors = verified.contact_error, verified.normal_error
-    assert fit is not None and errors[0] is not None and errors[1] is not None
+    assert errors[0] is not None and errors[1] is not None
     if not verified.misplaced:
         yield (
             f"Before closing, the fingertips are within {in_mm(fit.residual.max())} of the "
@@ -563,23 +425,6 @@ def _as_a_sample(verified: Verification, removal: Removal) -> str:
     verdict = "would be a sample" if kept else f"would be no sample ({removal.label})"
     rules = ", ".join(each.label for each in verified.unjudged)
     return f"In a dataset it {verdict}; not judged: {rules}."
-
-
-def _margin(verified: Verification) -> str:
-    """Return the friction that forces at the contacts alone need."""
-    physics = verified.placed.model.own_physics(verified.config.physics)
-    needed, simulated = verified.smallest_friction, physics.friction_hand
-    if np.isfinite(needed):
-        text = f"Forces at these points alone need a friction coefficient of {needed:.2f}"
-    else:
-        text = "Forces at these points alone are not enough at any friction"
-    text += f"; the simulation has {simulated:.2f}"
-    if verified.held and verified.method == "hand" and needed > simulated:
-        # A point does not resist twisting, but an area of contact does; and a grasp that slips is
-        # held at other points.
-        text += ", but the hand's contacts are areas"
-        text += "" if verified.stable else ", and the object is not held where they were"
-    return f"{text} (epsilon {verified.epsilon:.3f})."
 
 
 def in_mm(length: float) -> str:

@@ -1,9 +1,8 @@
 """The verdict on grasps of objects, each given by its contacts in {O} or by a posture.
 
 Input: `PlacedGrasp`s. Output: a `Verification` for each, in the caller's order. A posture is tried
-as given. For contacts, method `hand` finds palm poses that bring the fingertips to the points, and
-runs a trial from the best pose, as a build does. If that does not hold, it also tries the others.
-Method `forces` computes whether forces at points of the surface can lift the object. Every row
+as given. For contacts, palm poses are found that bring the fingertips to the points, and a trial is
+run from the best pose, as in a build. If that does not hold, the others are also tried. Every row
 with contacts is tried, even if the numbers look wrong, and faults are judged afterwards from the
 measurements. A wrong prediction, a failed solver and a lost object are outcomes, not exceptions.
 """
@@ -31,13 +30,12 @@ from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import Posture, run_trial, start_of
+from drakegrasp.simulation.posture import run_trial, start_of
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
-from drakegrasp.verification.forces import judge_forces
 from drakegrasp.verification.hints import fit_surface
 from drakegrasp.verification.placing import PlacedGrasp
-from drakegrasp.verification.result import Findings, PoseTrial, Verification
+from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.wrist_solver import WristFit, fit_wrist
 
 #: Decimals to which points [m] and unit normals are rounded: 0.1 mm and 0.06 degrees. This is
@@ -53,7 +51,8 @@ MARGINS = (1.0, 0.5)
 def verify_placed(grasp: PlacedGrasp) -> Verification:
     """Return whether a grasp holds its object; the contacts are rounded to 0.1 mm."""
     p_OQ, nhat_Q_O = grasp.in_object_frame()
-    found = Findings(
+    verdict = Verification(
+        grasp=grasp,
         outcome=Outcome.INVALID,
         reason=grasp.invalid,
         p_OQ=p_OQ,
@@ -61,19 +60,8 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
         surface_distance=np.full(len(p_OQ), np.nan),
     )
     if grasp.invalid:
-        return found.of(grasp)
-    if grasp.method == "posture":
-        return _best_stand(grasp, found)
-
-    # Round the contacts, and move the points to the surface if the caller wants it.
-    points, normals = rounded(p_OQ, nhat_Q_O)
-    with timed(found.seconds, "surface"):
-        surface = fit_surface(grasp.placed.model, points, normals)
-    if grasp.snap_points:
-        points, _ = rounded(surface.nearest, normals)
-    found = replace(found, p_OQ=points, nhat_Q_O=normals, surface_distance=surface.distance)
-    judge = _by_hand if grasp.method == "hand" else _by_forces
-    return judge(grasp, found)
+        return verdict
+    return _of_posture(verdict) if grasp.postures else _of_contacts(verdict)
 
 
 def rounded(p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
@@ -86,48 +74,60 @@ def rounded(p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
 
 @one_thread
 def first_fit(grasp: PlacedGrasp) -> WristFit:
-    """Return the wrist pose by which a valid grasp is judged."""
-    return next(_wrist_poses(grasp, *rounded(*grasp.in_object_frame())))
+    """Return the wrist pose by which valid contacts are judged."""
+    return _wrist_poses(grasp, *rounded(*grasp.in_object_frame()))[0]
 
 
-def _wrist_poses(grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array) -> Iterator[WristFit]:
-    """Yield the wrist poses that bring the fingertips to contacts, the best first."""
+def _wrist_poses(grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array) -> list[WristFit]:
+    """Return the wrist poses that bring the fingertips to contacts, the best first."""
     X_TO, hand = grasp.placed.X_TO_simulated, load_hand(grasp.config.hand_source)
-    yield from fit_wrist(hand, p_OQ, nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3]))
+    return fit_wrist(hand, p_OQ, nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3]))
 
 
-def _by_hand(grasp: PlacedGrasp, found: Findings) -> Verification:
+def _of_contacts(verdict: Verification) -> Verification:
     """Try palm poses for the contacts until one holds the object or enough were tried."""
+    grasp, seconds = verdict.grasp, verdict.seconds
+    p_OQ, nhat_Q_O = rounded(verdict.p_OQ, verdict.nhat_Q_O)
+    with timed(seconds, "surface"):
+        surface = fit_surface(grasp.placed.model, p_OQ, nhat_Q_O)
+    with timed(seconds, "fit"):
+        poses = _wrist_poses(grasp, p_OQ, nhat_Q_O)
+
     # Two contacts leave the palm's turn about their line open, and most of these poses are inside
     # the object or the table: the first clear pose counts as the first pose, unless all collide.
-    pass_collisions = len(found.p_OQ) == 2
+    pass_collisions = len(p_OQ) == 2
     tries, passed = list[PoseTrial](), list[PoseTrial]()
-    poses = _wrist_poses(grasp, found.p_OQ, found.nhat_Q_O)
-    while len(tries) < grasp.config.verify.max_tries:
-        with timed(found.seconds, "fit"):
-            fit = next(poses, None)
-        if fit is None:
+    for fit in poses:
+        if len(tries) == grasp.config.verify.max_tries:
             break
-        with timed(found.seconds, "simulate"):
-            tried = _try(grasp, found, fit)
+        with timed(seconds, "simulate"):
+            tried = _try(grasp, p_OQ, nhat_Q_O, fit)
         collides = pass_collisions and tried.trial.outcome is Outcome.START_COLLISION
         (passed if collides else tries).append(tried)
         if tried.held:
             break
-    return _judged(grasp, replace(found, tries=tuple(tries or passed[:1])))
+    return _judged(
+        replace(
+            verdict,
+            p_OQ=p_OQ,
+            nhat_Q_O=nhat_Q_O,
+            surface_distance=surface.distance,
+            tries=tuple(tries or passed[:1]),
+        )
+    )
 
 
-def _try(grasp: PlacedGrasp, found: Findings, fit: WristFit) -> PoseTrial:
+def _try(grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array, fit: WristFit) -> PoseTrial:
     """Run the trial of a wrist pose, and measure the errors of its contacts."""
     pregrasp, trial = _run(grasp.placed, fit, grasp.config)
 
     # Distances and angles for the fingertips that touch; a contact whose patches face each other
     # has no normal.
-    contact_error, normal_error = np.full((2, len(found.p_OQ)), np.nan)
+    contact_error, normal_error = np.full((2, len(p_OQ)), np.nan)
     if trial.closed is not None:
         closed = trial.closed.contacts
-        contact_error = np.linalg.norm(closed.p_OQ - found.p_OQ, axis=1)
-        cosine = np.sum(closed.nhat_Q_O * found.nhat_Q_O, axis=1)
+        contact_error = np.linalg.norm(closed.p_OQ - p_OQ, axis=1)
+        cosine = np.sum(closed.nhat_Q_O * nhat_Q_O, axis=1)
         normal_error = np.arccos(np.clip(cosine, -1.0, 1.0))
     return PoseTrial(
         fit=fit,
@@ -162,26 +162,26 @@ def _run(placed: PlacedObject, fit: WristFit, config: Config) -> tuple[Attempt, 
     return pregrasp, trial
 
 
-def _by_forces(grasp: PlacedGrasp, found: Findings) -> Verification:
-    """Compute whether forces at points of the surface can lift the object, without a hand."""
-    placed = grasp.placed
-    with timed(found.seconds, "forces"):
-        forces = judge_forces(
-            placed.model, placed.X_TO_simulated, found.p_OQ, found.nhat_Q_O, grasp.config
-        )
-    outcome = Outcome.SUCCESS if forces.held else Outcome.DROPPED
-    if not forces.on_surface:
-        outcome = Outcome.OFF_SURFACE
-    return replace(found, outcome=outcome, reason=forces.reason, forces=forces).of(grasp)
-
-
-def _best_stand(grasp: PlacedGrasp, found: Findings) -> Verification:
+def _of_posture(verdict: Verification) -> Verification:
     """Try a posture in each of its resting poses and preshapes; return the best verdict."""
-    tried = [
-        (_try_posture(grasp, replace(found, stand=stand), posture, shape), shape)
-        for stand, posture in enumerate(grasp.postures)
-        for shape in grasp.preshapes
-    ]
+    grasp, tried = verdict.grasp, list[tuple[Verification, str]]()
+    hand, nothing = load_hand(grasp.config.hand_source), np.full(len(verdict.p_OQ), np.nan)
+    for stand, (placed, given) in enumerate(zip(grasp.stands, grasp.postures, strict=True)):
+        for shape in grasp.preshapes:
+            posture = replace(given, preshape=shape or None)
+            start = start_of(posture, hand)
+            with timed(verdict.seconds, "simulate"):
+                trial = run_trial(placed, posture, grasp.config)
+            one = PoseTrial(
+                fit=None,
+                pregrasp=start,
+                trial=_of_all_fingers(trial, start.unused, hand.num_fingers),
+                contact_error=nothing,
+                normal_error=nothing,
+                removal=judge_sample(placed.model, trial, grasp.config),
+            )
+            found = replace(verdict, stand=stand, tries=(one,))
+            tried.append((_judged(found), shape))
     best, shape = max(
         tried, key=lambda f: (f[0].held, f[0].stable, f[0].precision, f[0].outcome.stage)
     )
@@ -195,27 +195,6 @@ def _best_stand(grasp: PlacedGrasp, found: Findings) -> Verification:
     if len(grasp.preshapes) > 1:
         notes.append(f"the best of {len(grasp.preshapes)} preshapes: {shape}")
     return replace(best, reason=f"{best.reason} ({'; '.join(notes)})") if notes else best
-
-
-def _try_posture(
-    grasp: PlacedGrasp, found: Findings, posture: Posture, preshape: str
-) -> Verification:
-    """Try a posture in a preshape; an empty name means no preshape."""
-    posture = replace(posture, preshape=preshape or None)
-    placed, fingers = grasp.stands[found.stand], len(found.p_OQ)
-    with timed(found.seconds, "simulate"):
-        trial = run_trial(placed, posture, grasp.config)
-    start = start_of(posture, load_hand(grasp.config.hand_source))
-    nothing = np.full(fingers, np.nan)
-    tried = PoseTrial(
-        fit=None,
-        pregrasp=start,
-        trial=_of_all_fingers(trial, start.unused, fingers),
-        contact_error=nothing,
-        normal_error=nothing,
-        removal=judge_sample(placed.model, trial, grasp.config),
-    )
-    return _judged(grasp, replace(found, posture=posture, tries=(tried,)))
 
 
 def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecord:
@@ -238,16 +217,16 @@ def _of_all_fingers(trial: TrialRecord, unused: int, fingers: int) -> TrialRecor
     )
 
 
-def _judged(grasp: PlacedGrasp, found: Findings) -> Verification:
+def _judged(verdict: Verification) -> Verification:
     """Return the verdict of the first trial, which decides."""
-    trial, start, placed = found.tries[0].trial, found.tries[0].pregrasp, grasp.stands[found.stand]
+    trial, start, placed = verdict.tries[0].trial, verdict.tries[0].pregrasp, verdict.placed
     message = trial.message
     if trial.outcome is Outcome.START_COLLISION:
-        about = grasp.config.physics, grasp.config.hand_source, start.preshape
+        about = verdict.config.physics, verdict.config.hand_source, start.preshape
         met = start_meetings(cached_scene(placed.model, *about), placed.X_TO_simulated, start)
         message = "; ".join(f"{', '.join(links)} in the {other}" for other, links in met.items())
     reason = trial.outcome.text + (f": {message}" if message else "")
-    return replace(found, outcome=trial.outcome, reason=reason).of(grasp)
+    return replace(verdict, outcome=trial.outcome, reason=reason)
 
 
 #: Receives results as they are computed: called with a grasp's index and its result.
@@ -283,11 +262,12 @@ def verify_batch(
     results: dict[int, Verification] = {}
     delivered = holding = 0
     report(0, len(grasps), holding=holding)
-    work = partial(_verify_together, explained=explained)
-    for findings in execute(work, _tasks(grasps, together)):
+    for finished in execute(
+        partial(_verify_together, explained=explained), _tasks(grasps, together)
+    ):
         # Workers return what they found, without the meshes.
-        for index, found in findings:
-            results[index] = found.of(by_index[index])
+        for index, found in finished:
+            results[index] = Verification(grasp=by_index[index], **found)
             holding += results[index].success
 
         # Deliver these results, and later results that were waiting for them.
@@ -307,7 +287,7 @@ def _tasks(grasps: Sequence[PlacedGrasp], together: int) -> Iterator[list[Placed
 
 def _verify_together(
     grasps: Sequence[PlacedGrasp], *, explained: bool
-) -> list[tuple[int, Findings]]:
+) -> list[tuple[int, dict[str, Any]]]:
     """Return what was found of the grasps of a task, each with its index."""
     results = [verify_placed(grasp) for grasp in grasps]
-    return [(r.grasp.index, r.explained() if explained else r.findings) for r in results]
+    return [(r.grasp.index, (r.explained() if explained else r).findings()) for r in results]

@@ -265,9 +265,6 @@ class WristFit:
             its point [m^2].
         residual: (k,), distance of each predicted point from its fingertip's surface [m].
         normal_error: (k,), angle between each pad's inward normal and the predicted normal [rad].
-        status: SLSQP's exit mode; 0 is success.
-        message: SLSQP's message for the exit mode.
-        iterations, evaluations: Numbers of SLSQP's iterations and of evaluations of the problem.
     """
 
     X_OG: Array
@@ -276,10 +273,6 @@ class WristFit:
     objective: float
     residual: Array
     normal_error: Array
-    status: int
-    message: str
-    iterations: int
-    evaluations: int
 
 
 def fit_wrist(
@@ -327,7 +320,6 @@ def solve(problem: WristProblem) -> WristFit:
         options={"maxiter": MAX_ITERATIONS, "ftol": TOLERANCE},
     )
     solution = scaled.at(result.x)
-    evaluations = scaled.evaluations
 
     # Refine the fingers at the palm pose of the solution.
     problem = replace(problem, X_OS=solution.X_OG)
@@ -342,10 +334,6 @@ def solve(problem: WristProblem) -> WristFit:
         objective=float(solution.residuals @ solution.residuals),
         residual=np.linalg.norm(nearest_on_pads(problem.constants.pads, p_FiQ) - p_FiQ, axis=1),
         normal_error=np.arccos(np.clip(facing, -1.0, 1.0)),
-        status=int(result.status),
-        message=str(result.message),
-        iterations=int(result.nit),
-        evaluations=evaluations,
     )
 
 
@@ -401,7 +389,6 @@ class _ScaledProblem:
         self._problem = problem
         self._start = np.concatenate([np.zeros(POSE), problem.posture])
         self._last = evaluate(problem, self._start)
-        self.evaluations = 1
         J = self._last.jacobian
         H = 2.0 * J.T @ J / UNIT
         H += DAMPING * np.trace(H) / len(H) * np.eye(len(H))
@@ -416,7 +403,6 @@ class _ScaledProblem:
         """Return the evaluation of the problem at y (n,)."""
         if not np.array_equal(y, self._y):
             self._y, self._last = y.copy(), evaluate(self._problem, self.x(y))
-            self.evaluations += 1
         return self._last
 
     def objective(self, y: Array) -> tuple[float, Array]:

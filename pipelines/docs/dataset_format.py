@@ -176,11 +176,11 @@ each, gzip 1. Unlike in the data files, values of a hand that was not lifted are
 _VERIFICATION = """
 ## The results of `drakegrasp verify`
 
-`drakegrasp verify ... --out NAME` writes two files, with one row or line per grasp in the order of
-the input. `NAME.h5` has the attributes `convention_*`, `schema_version`, `config`, `config_hash`,
-`seed`, `versions`, `fingers` and `joints`, and a group `/grasps`. Values that a method or a stage
-did not reach are NaN, 0, false or empty; "from" names the stage from which a value exists. Equal
-input produces equal bytes.
+`drakegrasp verify ... --out FILE.h5` writes one row per grasp in the order of the input. The file
+has the attributes `convention_*`, `schema_version`, `config`, `config_hash`, `seed`, `versions`,
+`fingers` and `joints`, and a group `/grasps`. Values that a posture or a stage did not reach are
+NaN, 0, false or empty; "from" names the stage from which a value exists. Equal input produces equal
+bytes.
 """
 
 _ROWS = """
@@ -189,13 +189,11 @@ attributes `split`, `camera` and `shards` of the data file:
 """
 
 _LINES = """
-`NAME.jsonl`, or standard output without `--out`, has one JSON object per line; NaN and inf become
-`null`. `index` is the grasp's position in the input, `success` whether it holds, `outcome` the
-label of the verdict, `explain` the verdict in sentences, `X_OG` a 4 x 4 matrix. `solver` (SLSQP's
-`status`, `message`, `iterations`), `closed` and `lifted` (contacts at these moments) and `forces`
-(method `forces`: fractions, and the contacts of the surface that were selected) are objects, or
-`null` if they were not reached; `seconds` is the wall-clock time by stage. Angles whose names end
-in `_deg` are in degrees; all other values are as in the table, in its units.
+Without `--out`, or with `--json`, one JSON object per line goes to standard output, with the same
+fields, in the same units. NaN, inf and what was not reached become `null`, outcomes and filters are
+named, and poses are 4 x 4 matrices. Further keys are `index`, the grasp's position in the input;
+`outcomes` of all tried wrist poses; `unjudged`, the filters that a verdict cannot apply; `explain`,
+the verdict in sentences; and `seconds`, the wall-clock time by stage.
 """
 
 _SHARDS = """

@@ -53,7 +53,15 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "export hf": ("export", "{out}", "{to}/hf", "--to", "hf", "--quiet"),
     "export dexgraspbench": ("export", "{out}", "{to}/dex", "--to", "dexgraspbench", "--quiet"),
     "export glb": ("export", "{out}", "{to}/glb", "--to", "glb", "--quiet"),
-    "verify": ("verify", f"{{out}}/{OTO}", "--out", "{to}/verdicts", "--workers", "1", "--quiet"),
+    "verify": (
+        "verify",
+        f"{{out}}/{OTO}",
+        "--out",
+        "{to}/verdicts.h5",
+        "--workers",
+        "1",
+        "--quiet",
+    ),
     "build": _BUILD,
 }
 
@@ -326,17 +334,8 @@ def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
             file["rows"] = np.arange(2)
         sound = (tmp_path / "sound.h5").read_bytes()
     kinds, target = PREDICTIONS[suffix]
-    command = f"verify {{file}} {target} --out {{to}}/verdicts --workers 1 --quiet"
+    command = f"verify {{file}} {target} --out {{to}}/verdicts.h5 --workers 1 --quiet"
     walk_file(base, tmp_path, sound, suffix, kinds, command, "rows", "contact points")
-
-
-@pytest.mark.parametrize("share", [4, in_second_tier(1)])
-def test_cameras(base: Path, tmp_path: Path, share: int) -> None:
-    np.save(tmp_path / "grasp.npy", array_kinds.GRASP)
-    sound, kinds = _npy(tmp_path, np.eye(4)), array_kinds.CAMERA_NPY[::share]
-    command = "verify {tmp}/grasp.npy --object {mesh} --frame camera --camera {file}"
-    command += " --out {to}/verdicts --workers 1 --quiet"
-    walk_file(base, tmp_path, sound, ".npy", kinds, command, "X_TC", "contact points")
 
 
 def test_decisions(base: Path, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections import namedtuple
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -17,48 +16,25 @@ from drakegrasp.cli.doctor import Finding, diagnose
 from drakegrasp.vision import probe_image
 
 
-@pytest.fixture
-def no_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Spare the tests that are about something else the child process."""
-    monkeypatch.setattr(
-        doctor, "check_image", lambda: Finding(name="test image", ok=True, what="not made")
-    )
-
-
 @pytest.mark.sim
 @needs_egl
-def test_healthy_machine_lacks_nothing(tmp_path: Path) -> None:
-    findings = diagnose(tmp_path)
+def test_healthy_machine_lacks_nothing() -> None:
+    findings = diagnose()
     assert [f for f in findings if not f.ok] == []
     assert {f.remedy for f in findings} == {""}
     assert all(f.what for f in findings)
-    names = "Python, glibc, Drake, EGL, test image, writing, disk, cores, memory"
+    names = "Python, Drake, EGL, test image, cores, memory"
     assert [f.name for f in findings] == names.split(", ")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.usefixtures("no_image")
-def test_current_directory_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (writing,) = (f for f in diagnose() if f.name == "writing")
-    assert writing == Finding(name="writing", ok=True, what=str(tmp_path))
 
 
 EGL, DRAKE = "apt-get install libegl1 libgl1-mesa-dri", "pip install 'drake>=1.51.1,!=1.52.0'"
-CONTAINER = "use a system or container with glibc 2.34 or newer, such as Ubuntu 22.04"
 #: What a machine may have: the check, what is there, whether it will do, what is said, the remedy.
 MACHINES = [
     ("python", (3, 10, 12, "final", 0), False, "", "install Python 3.11 or newer"),
-    ("glibc", ("glibc", "2.34"), True, "glibc 2.34", ""),
-    ("glibc", ("glibc", "2.4"), False, "glibc 2.4", CONTAINER),
-    ("glibc", ("glibc", "2.31"), False, "glibc 2.31", CONTAINER),
-    ("glibc", ("glibc", "3.0"), True, "glibc 3.0", ""),
-    ("glibc", ("musl", "1.2.5"), False, "musl 1.2.5", CONTAINER),
-    ("glibc", ("", ""), False, "another C library", CONTAINER),
-    ("drake", "1.51.1", True, "1.51.1: works; attempts take up to a tenth longer", ""),
+    ("drake", "1.51.1", True, "1.51.1", ""),
     ("drake", "1.52.0", False, "1.52.0", DRAKE),
     ("drake", "1.52.0.post1", False, "1.52.0.post1", DRAKE),
-    ("drake", "1.52.1", True, "1.52.1: works; attempts take up to a tenth longer", ""),
+    ("drake", "1.52.1", True, "1.52.1", ""),
     ("drake", "1.58.0", True, "1.58.0", ""),
     ("drake", "1.51.0", False, "1.51.0", DRAKE),
     ("drake", "0.0.20260101", False, "0.0.20260101", DRAKE),
@@ -79,7 +55,6 @@ def test_what_is_missing_is_told_with_what_mends_it(
 
     place, name, value = {
         "python": (sys, "version_info", there),
-        "glibc": (doctor.platform, "libc_ver", lambda: there),
         "drake": (doctor.metadata, "version", version),
         "egl": (doctor, "EGL_LIBRARY", there),
     }[check]
@@ -87,7 +62,6 @@ def test_what_is_missing_is_told_with_what_mends_it(
     finding = getattr(doctor, f"check_{check}")()
     assert (finding.ok, finding.remedy) == (ok, remedy)
     assert finding.what.startswith(what)
-    assert ("a tenth longer" in finding.what) == ("a tenth longer" in what)
 
 
 @pytest.mark.parametrize(
@@ -135,30 +109,6 @@ def test_child_does_not_import_what_lies_in_the_current_directory(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(probe_image, "_CHILD", "import colorsys; print('3000 3012')")
     assert doctor.check_image().ok
-
-
-@pytest.mark.usefixtures("no_image")
-def test_directory_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    """A file in the way stops even root; one that does not exist yet is no lack, and not made."""
-    (tmp_path / "file").write_text("")
-    for folder, ok, what in (
-        (tmp_path / "file" / "out", False, f"{tmp_path / 'file'}: Not a directory"),
-        (tmp_path / "new" / "out", True, str(tmp_path)),
-    ):
-        writing = {finding.name: finding for finding in diagnose(folder)}["writing"]
-        assert (writing.ok, writing.what) == (ok, what)
-        assert ("--out" in writing.remedy) is not ok
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: usage(1e12, 1e12, 3e8))
-    finding = doctor.check_disk(tmp_path)
-    assert (finding.ok, finding.what) == (False, "0.3 GB free")
-    assert "free 2 GB" in finding.remedy
-    monkeypatch.undo()
-    assert not doctor.check_disk(tmp_path / "none").ok
 
 
 def test_memory_is_the_machines_or_the_containers_whichever_is_less(

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import trimesh
@@ -13,12 +10,8 @@ from cyclopts.annotations import get_hint_name
 from helpers.commands import arguments_of, run
 from helpers.datasets import SLIPPED, end_lift
 from helpers.golden import Golden
-from rich.console import Console
-from rich.table import Table
 
 from drakegrasp.cli.main import COMMANDS, app
-from drakegrasp.cli.tables import score_table, verdict_table
-from drakegrasp.outcomes import Outcome
 
 
 def options_of(name: str) -> list[str]:
@@ -71,42 +64,3 @@ def test_output(out: Path, tmp_path: Path, golden: Golden, name: str, arguments:
     for word, path in paths.items():
         text = text.replace(str(path), word)
     golden(f"commands/{name}", "\n".join(line.rstrip() for line in text.splitlines()))
-
-
-def printed(table: Table) -> str:
-    text = StringIO()
-    Console(width=200, file=text).print(table)
-    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
-
-
-def test_table_of_verdicts(golden: Golden) -> None:
-    def result(outcome: Outcome, **more: bool) -> Any:
-        usual = dict.fromkeys(("success", "precision", "stable", "sample", "held_any"), False)
-        return SimpleNamespace(outcome=outcome, **usual | more)
-
-    results = [
-        result(Outcome.SUCCESS, success=True, precision=True, held_any=True),
-        result(Outcome.SUCCESS, precision=True, stable=True, sample=True, held_any=True),
-        *[result(Outcome.DROPPED, held_any=i == 0) for i in range(5)],
-        *[result(Outcome.INVALID)] * 3,
-        *[result(Outcome.TIMEOUT)] * 2,
-    ]
-    golden("commands/verdicts", printed(verdict_table(results)))
-
-
-def test_table_of_scores(golden: Golden) -> None:
-    def measures(value: float) -> dict[str, Any]:
-        one = {"value": value, "low": value / 2.0, "high": 1.0 - value / 2.0}
-        return {"measures": {"headline": one, "held": {"value": value / 4.0}}}
-
-    card = {
-        "sets": {"net": measures(0.123), "own": measures(0.5)},
-        "measures": ["headline", "held"],
-        "settings": {},
-        "objects": 7,
-        "intervals": {"drawn": "objects"},
-    }
-    seconds = {"net": 1.234, "own": 10.0}
-    other = {**card, "settings": {"protocol": {"protocol": "shake"}}, "objects": 1}
-    tables = [printed(score_table(each, seconds)) for each in (card, other)]
-    golden("commands/scores", "\n".join(tables))

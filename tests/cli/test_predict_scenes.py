@@ -134,7 +134,7 @@ def test_a_cloud_may_be_in_any_unit(cloud: Path, own: Attempts, tmp_path: Path) 
     )
     result = run("predict", path, "--units", "mm", "--out", out, "--count", 3)
     assert result.exit_code == 0, result.output
-    assert result.stdout.split()[0] == str(out) and "The best grasps" in result.stdout
+    assert result.stdout == f"{out}\n"
     found = read_attempts(out, load_hand(), of="mug")
     assert found.frame == "table" and len(found) == 3
     np.testing.assert_allclose(found.X_FG, own.X_FG[:3], atol=1e-6)
@@ -154,7 +154,7 @@ def test_grasps_of_a_depth_image_are_in_the_frame_of_its_camera(
     given += ("--mask", tmp_path / "mask.png", "--count", 3)
     result = run(*given, "--out", tmp_path / "fitted.h5")
     assert result.exit_code == 0, result.output
-    assert "table: " in result.stderr and "palm in" in result.stdout
+    assert "table: " in result.stderr
     with h5py.File(tmp_path / "fitted.h5") as file:
         assert file["frame"].asstr()[()] == "camera"
         X_TC_fitted, X_CG = file["X_TC"][0], file["X_FG"][:]

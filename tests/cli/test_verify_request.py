@@ -36,7 +36,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def placed(out: Path, grasps: Path | None = None, **options: Any) -> Any:
     """Return the grasps of a file, or a dataset's own, as options place them."""
-    return place(grasps or out / OTO, Target(**{"method": "forces", **options}))
+    return place(grasps or out / OTO, Target(**options))
 
 
 @pytest.mark.parametrize("overrides", [(), ("verify.max_tries=1",)])
@@ -140,14 +140,13 @@ def test_postures_of_a_mesh_are_those_that_name_it(
     grasps, _, _ = place(*given)
     assert [grasp.index for grasp in grasps] == list(range(count))
     told = capsys.readouterr().err
-    assert words in told and f"{count} of {count} rows of the postures name no resting" in told
+    assert words in told
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"frame": "camera"}, "--frame must be left out with postures, got camera"),
-        ({"method": "forces"}, "--method must be left out with postures, got forces"),
         ({"hand": "allegro"}, "--hand must be left out with postures and --dataset, got allegro"),
         ({"mesh": Path("a.obj")}, "--object or --dataset must be given, got both"),
     ],
@@ -203,26 +202,6 @@ def test_grasps_of_others_are_tried_on_rows_that_leave_fingers_out(tmp_path: Pat
     assert len(grasps) == len(predicted) > 0
     with pytest.raises(GraspError, match="test must have contacts of all fingers, got "):
         placed(out, split="test")
-
-
-def test_the_rows_of_an_array_are_those_of_the_option(drawn: Path, tmp_path: Path) -> None:
-    data = GraspDataset(drawn / OTO, split="test")
-    path = tmp_path / "some.npy"
-    np.save(path, data.column("grasps")[[2, 0, 1]])
-    given = {"grasps": path, "dataset": drawn / OTO}
-    with pytest.raises(GraspError, match=r"a grasp for each of the .*, got 3 grasps .*--rows"):
-        placed(drawn, **given)
-    np.save(tmp_path / "rows.npy", [2, 0, 1])
-    for rows in ("2,0-1", str(tmp_path / "rows.npy")):
-        grasps, _, stated = placed(drawn, **given, rows=rows)
-        masses = {grasp.index: grasp.placed.model.mass for grasp in grasps}
-        true = data.column("object_props/work2mass")[[2, 0, 1], 0]
-        assert [masses[i] for i in range(3)] == pytest.approx(true.tolist())
-        assert stated is not None
-        assert stated.row.tolist() == [2, 0, 1]
-    for rows in ("2,0", "2,x,1", "-1", "1-", "0-99999999999"):
-        with pytest.raises(GraspError, match="rows must be"):
-            placed(drawn, **given, rows=rows)
 
 
 def test_an_unknown_frame_is_refused_with_the_known_ones(tmp_path: Path) -> None:

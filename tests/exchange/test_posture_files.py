@@ -233,14 +233,6 @@ def test_several_grasps_of_one_dictionary_are_rows(tmp_path):
     np.testing.assert_allclose(table.X_FG, POSES[[0, 0, 0]], atol=1e-9)
 
 
-def test_quaternions_in_the_other_order_are_kept_for_hints(tmp_path):
-    content = dexgraspbench()
-    for key in ("obj_pose", "pregrasp_qpos", "grasp_qpos", "squeeze_qpos"):
-        content[key][3:7] = np.roll(content[key][3:7], -1)
-    table = read_attempts(write_dictionary(tmp_path / "0.npy", content), HAND)
-    np.testing.assert_allclose(table.X_FG_xyzw, POSES[:1], atol=1e-9)
-
-
 def isaac_grasp(X_GB: np.ndarray, **stages: dict[str, float]) -> dict[str, Any]:
     w, *xyz = quaternion(X_GB).tolist()
     place = {"position": X_GB[:3, 3].tolist(), "orientation": {"w": w, "xyz": xyz}}

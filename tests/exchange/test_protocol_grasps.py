@@ -32,7 +32,7 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, joint_order
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.verification.placing import place_on_object
+from drakegrasp.verification.placing import contacts_on_object
 from drakegrasp.verification.verify import first_fit
 
 HAND = load_hand()
@@ -79,11 +79,11 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
 
     # The same by the lift in Drake, in files.
     given = ("verify", tmp_path / "own.npz", "--object", mesh, "--workers", 1)
-    result = run(*given, "--out", tmp_path / "lift", "--json")
+    result = run(*given, "--out", tmp_path / "lift.h5", "--json")
     assert result.exit_code == 0, result.output
     held, none, lost = map(json.loads, result.stdout.splitlines())
-    assert held["held"] and held["success"] and held["method"] == "posture"
-    np.testing.assert_allclose(held["closed"]["q"], end.q, atol=1e-3)
+    assert held["held"] and held["success"] and held["fit_residual"] is None
+    np.testing.assert_allclose(held["closed_q"], end.q, atol=1e-3)
     np.testing.assert_allclose(held["X_OG"], np.asarray(record.X_OG), atol=1e-5)
     assert none["outcome"] == "invalid"
     assert none["reason"].startswith("the palm's pose must have 0 0 0 1")
@@ -176,7 +176,7 @@ def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_
     for i, model in enumerate(models):
         asked = numbers + np.r_[np.tile([0.0, 0.0, 0.004 * i], 3), np.zeros(9)]
         asked[0] = np.nan if i == 2 else asked[0]
-        (grasp,) = place_on_object(asked, PlacedObject(model=model, X_TO=standing(model)))
+        (grasp,) = contacts_on_object(asked, PlacedObject(model=model, X_TO=standing(model)))
         placed.append(grasp)
 
     sent: list[int] = []

@@ -83,9 +83,7 @@ def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) 
     rows = [len(data) - 1, 0]
     grasps = np.array([data[row].grasp for row in rows])
     usual = load_prepared(randomized, NAME, read_manifest(randomized).config).model
-    for row, verdict in zip(
-        rows, verify_grasps(grasps, data, rows=rows, method="forces"), strict=True
-    ):
+    for row, verdict in zip(rows, verify_grasps(grasps, data, rows=rows), strict=True):
         props, conditions = data[row].props, data[row].conditions
         model = verdict.placed.model
         assert model.mass == pytest.approx(float(props["work2mass"][0]))

@@ -46,7 +46,7 @@ BENCHMARK, BENCHMARK_CANDIDATES = ("4_wineglass_1", "1_mug_2"), 3
 #: Verdicts of each method, and of postures.
 VERDICTS, POSTURES = 15, 6
 #: Public attributes of a verdict that are numbers.
-NUMBERS = ("success", "p_OQ", "nhat_Q_O", "surface_distance", "epsilon", "smallest_friction")
+NUMBERS = ("success", "p_OQ", "nhat_Q_O", "surface_distance", "epsilon")
 #: An array of more numbers, as of images, is compared by means on other machines.
 LARGE = 10_000
 #: Simulated numbers of other machines are as near as this: metres, radians, newtons, shares.
@@ -170,11 +170,8 @@ def verdicts(out: Path, split: str, folder: Path) -> Pins:
     """Verify samples of a dataset, some moved by millimetres, and postures of its closed hands."""
     write_moved(out, split, folder / "moved.h5")
     write_postures(out, folder / "postures.npz")
-    found: Pins = {}
-    for method in ("hand", "forces"):
-        how = ("--split", split, "--method", method)
-        found |= verified(folder / "moved.h5", out, folder / method, *how)
-    return found | verified(folder / "postures.npz", out, folder / "posture")
+    found = verified(folder / "moved.h5", out, folder / "hand.h5", "--split", split)
+    return found | verified(folder / "postures.npz", out, folder / "posture.h5")
 
 
 def write_moved(out: Path, split: str, path: Path) -> None:
@@ -207,12 +204,10 @@ def write_postures(out: Path, path: Path) -> None:
 
 
 def verified(grasps: Path, out: Path, to: Path, *how: object) -> Pins:
-    """Return the arrays and the lines of the verdicts on a file."""
+    """Return the arrays of the verdicts on a file."""
     data = ("--dataset", out / "grasping_oto.hdf5", "--workers", 1, "--quiet")
     command("verify", grasps, *data, *how, "--out", to)
-    lines = [json.loads(line) for line in to.with_suffix(".jsonl").read_text().splitlines()]
-    name = f"verdicts/{to.name}"
-    return arrays(to.with_suffix(".h5"), name) | leaves(lines, f"{name}/lines")
+    return arrays(to, f"verdicts/{to.stem}")
 
 
 def score(out: Path, split: str, to: Path) -> Pins:
@@ -231,14 +226,12 @@ def score(out: Path, split: str, to: Path) -> Pins:
 
 
 def calls(out: Path, split: str) -> Pins:
-    """Return what public calls say of a sample, by both methods, and of a posture."""
+    """Return what public calls say of a sample, and of a posture."""
     data = drakegrasp.GraspDataset(out / "grasping_oto.hdf5", split=split)
-    found: Pins = {}
-    for method in ("hand", "forces"):
-        verdict = drakegrasp.verify_grasp(data[0].grasp, data, row=0, method=method)
-        told = {name: getattr(verdict, name) for name in NUMBERS}
-        told |= {"reason": verdict.reason, "outcome": verdict.outcome.label}
-        found |= {f"calls/{method}/{k}": np.asarray(v) for k, v in told.items()}
+    verdict = drakegrasp.verify_grasp(data[0].grasp, data, row=0)
+    told = {name: getattr(verdict, name) for name in NUMBERS}
+    told |= {"reason": verdict.reason, "outcome": verdict.outcome.label}
+    found = {f"calls/hand/{k}": np.asarray(v) for k, v in told.items()}
 
     # Two fingers and the thumb around a box, the palm above it.
     box = drakegrasp.place_object(trimesh.creation.box([0.07, 0.07, 0.07]))

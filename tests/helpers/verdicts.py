@@ -18,8 +18,6 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import Closed, TrialRecord
-from drakegrasp.table import Table
-from drakegrasp.verification.forces import ContactForces, ForceVerdict
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.wrist_solver import WristFit
@@ -62,8 +60,6 @@ def some_fit(X_OG: Array, **values: Any) -> WristFit:
     usual: dict[str, Any] = {
         "spread": 0.25, "closing": np.array([0.5, 0.6, 0.7]), "objective": 1e-6,
         "residual": np.array([0.0, 1e-3, 1 / 3]), "normal_error": np.deg2rad([1.0, 2.0, 60.0]),
-        "status": 0, "message": "Optimization terminated successfully", "iterations": 12,
-        "evaluations": 15,
     }  # fmt: skip
     return WristFit(X_OG=X_OG, **usual | values)
 
@@ -83,19 +79,19 @@ def some_try(trial: TrialRecord, **values: Any) -> PoseTrial:
 def some_verdict(model: ObjectModel, **values: Any) -> Verification:
     """Return a verdict on contacts of three fingertips on an object, with other values where given.
 
-    Fields of the grasp may be among the values. Margins and hints are none, unless given.
+    Fields of the grasp may be among the values. Epsilon and hints are none, unless given.
     """
     nothing = np.full((3, 3), np.nan)
     grasp: dict[str, Any] = {
         "index": 0, "stands": (PlacedObject(model=model, X_TO=standing(model)),),
-        "method": "hand", "config": load_config(), "p_AQ": nothing, "nhat_Q_A": nothing,
+        "config": load_config(), "p_AQ": nothing, "nhat_Q_A": nothing,
     }  # fmt: skip
     names = {f.name for f in fields(PlacedGrasp)}
     grasp |= {name: values.pop(name) for name in names & values.keys()}
     usual: dict[str, Any] = {
         "outcome": Outcome.DROPPED, "reason": "so it is", "p_OQ": np.zeros((3, 3)),
-        "nhat_Q_O": np.eye(3), "surface_distance": np.zeros(3), "margin": (np.nan, np.nan),
-        "doubts": ((), None),
+        "nhat_Q_O": np.eye(3), "surface_distance": np.zeros(3), "margin": np.nan,
+        "told": (),
     }  # fmt: skip
     return Verification(grasp=PlacedGrasp(**grasp), **usual | values)
 
@@ -103,25 +99,3 @@ def some_verdict(model: ObjectModel, **values: Any) -> Verification:
 def asked_otherwise(verdict: Verification, **values: Any) -> Verification:
     """Return a verdict on a grasp with other values."""
     return replace(verdict, grasp=replace(verdict.grasp, **values))
-
-
-def some_forces(*, points: float = 0.5, patches: float = 0.25) -> ForceVerdict:
-    """Return what forces of three fingertips of 10 N do that take these shares of it."""
-    contacts = Table(
-        p_OQ=np.full((3, 3), 0.01),
-        nhat_Q_O=np.eye(3),
-        distance=np.array([0.001, 0.002, 0.0]),
-        inside=np.array([False, True, False]),
-        angle=np.deg2rad([1.0, 2.0, 3.0]),
-        off_surface=np.zeros(3, dtype=bool),
-    )
-    forces = [
-        ContactForces(
-            feasible=bool(np.isfinite(share)),
-            f_Q_O=np.eye(3),
-            normal=np.full(3, 10.0 * share),
-            shares=np.full(3, share),
-        )
-        for share in (points, patches)
-    ]
-    return ForceVerdict(contacts=contacts, points=forces[0], patches=forces[1])

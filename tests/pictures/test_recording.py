@@ -9,7 +9,6 @@ import re
 import socket
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import h5py
@@ -17,7 +16,6 @@ import msgpack
 import numpy as np
 import pytest
 from helpers.objects import CUBE, from_above, standing
-from helpers.verdicts import some_forces
 
 from drakegrasp.config import Config
 from drakegrasp.generation.replay import record_trial
@@ -25,11 +23,10 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures import recording
-from drakegrasp.pictures.recording import record_attempt
+from drakegrasp.pictures.recording import record_attempt, record_object
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.trial import run_attempt
-from drakegrasp.verification.figure import record_verification
 
 pytestmark = pytest.mark.sim
 
@@ -60,15 +57,6 @@ def keys_of(path: Path) -> bytes:
     """Return the one command that holds the recording."""
     (animation,) = (c for c in commands_of(path) if ANIMATION in c)
     return animation
-
-
-def not_simulated(cube: ObjectModel, config: Config, *, forces: object = None) -> SimpleNamespace:
-    """Return a verification that ended without a trial."""
-    placed = SimpleNamespace(model=cube, X_TO_simulated=standing(cube))
-    return SimpleNamespace(
-        placed=placed, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, pregrasp=None, forces=forces, config=config,
-        explain=lambda: "It was not simulated.",
-    )  # fmt: skip
 
 
 def test_recording_a_trial_changes_no_bit_of_it(
@@ -113,23 +101,22 @@ def test_attempt_that_is_not_simulated_is_shown_all_the_same(
     assert b"predicted" not in everything
 
 
-@pytest.mark.parametrize("judged", [False, True])
-def test_verification_without_a_trial_shows_the_object_and_contacts_that_forces_judged(
-    cube: ObjectModel, config: Config, tmp_path: Path, judged: bool
+def test_object_at_rest_is_shown_without_a_hand(
+    cube: ObjectModel, config: Config, tmp_path: Path
 ) -> None:
-    verified = not_simulated(cube, config, forces=some_forces() if judged else None)
-    record_verification(verified, tmp_path / "still.html")
+    record_object(cube, standing(cube), config, tmp_path / "still.html", caption="It rests.")
     everything = b"".join(commands_of(tmp_path / "still.html"))
     assert OBJECT in everything and HAND not in everything
-    assert (b"predicted/1" in everything) == judged
+    assert ">It rests.</p>" in (tmp_path / "still.html").read_text()
 
 
 def test_arrow_of_a_contact_begins_at_the_contact(
-    cube: ObjectModel, config: Config, tmp_path: Path
+    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
 ) -> None:
-    verified = not_simulated(cube, config, forces=some_forces())
-    record_verification(verified, tmp_path / "v.html")
-    said = map(msgpack.unpackb, commands_of(tmp_path / "v.html"))
+    missed, path = replace(attempt, ray_hits=False), tmp_path / "v.html"
+    contacts = {"p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O}
+    record_attempt(cube, standing(cube), missed, config, path, **contacts)
+    said = map(msgpack.unpackb, commands_of(path))
     places = {
         command["path"].partition("predicted/")[2]: np.reshape(command["matrix"], (4, 4)).T
         for command in said
@@ -160,7 +147,7 @@ def test_only_this_machine_is_served_and_only_meanwhile(
     monkeypatch.setattr(recording, "_make_meshcat", spy)
     missed = replace(attempt, ray_hits=False)
     record_attempt(cube, standing(cube), missed, config, tmp_path / "a.html")
-    record_verification(not_simulated(cube, config), tmp_path / "b.html")
+    record_object(cube, standing(cube), config, tmp_path / "b.html")
     assert os.environ["DRAKE_ALLOW_NETWORK"] == "none"
     assert [url.hostname for url in urls] == ["localhost"] * 2
     for url in urls:

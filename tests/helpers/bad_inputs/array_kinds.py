@@ -85,21 +85,6 @@ PREDICTIONS_NPY: tuple[Kind, ...] = (
     _npy("pairs", np.zeros(18, dtype=[("a", "f8")])),
     _npy("objects", np.array([None] * 18, dtype=object)),
 )
-CAMERA_NPY: tuple[Kind, ...] = (
-    *ANY_FILE,
-    *_HEADERS,
-    _npy("a single number", 1.0),
-    _npy("eleven numbers", np.zeros(11)),
-    _npy("3 x 3", np.eye(3)),
-    _npy("for other grasps", np.tile(np.eye(4), (7, 1, 1))),
-    _npy("texts", np.full((4, 4), "1")),
-    _npy("objects", np.full((4, 4), None)),
-    _npy("NaN", np.full((4, 4), np.nan)),
-    _npy("zeros in a pose", np.zeros((4, 4))),
-    _npy("mirrored", np.diag([1.0, 1.0, -1.0, 1.0])),
-    _npy("scaled", np.diag([2.0, 2.0, 2.0, 1.0])),
-    _npy("another last row", np.ones((4, 4))),
-)
 
 
 def _predictions_hdf5(name: str, edit: Callable[[h5py.File], object]) -> Kind:
