@@ -20,7 +20,7 @@ from drakegrasp.errors import counted
 if TYPE_CHECKING:
     from drakegrasp.hand.checks import Finding
 
-objects = new_group("objects", "List or export the built-in objects, or make morphs of meshes.")
+objects = new_group("objects", "List or export the built-in objects.")
 hand = new_group("hand", "List the hands, draft a hand file, or check a hand.")
 
 
@@ -105,46 +105,6 @@ def export_objects(directory: Folder, /, *, per_class: Count = 2, objects_seed: 
     with progress_bar("objects", "meshes") as progress:
         paths = export_builtin(directory, config=config.builtin, progress=progress)
     say(f"{counted(len(paths), 'mesh', 'meshes')} in {directory}")
-
-
-@objects.command(name="morph")
-def morph_objects(
-    mesh_dir: Folder,
-    /,
-    *,
-    per_mesh: Positive,
-    seed: Annotated[Count, Parameter(validator=Number(gte=0))] = 0,
-    out: Folder,
-    units: Units = "m",
-    manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
-) -> None:
-    """Create objects with other proportions from meshes.
-
-    Each mesh of MESH_DIR is widened, narrowed and stretched along a random axis. The morphs (.obj,
-    metres, +z up) stand on the table like the mesh, and an objects.yaml in DIR keeps their classes.
-    The same seed writes the same files.
-
-    Args:
-        mesh_dir: Directory of meshes.
-        per_mesh: Number of morphs of each mesh.
-        seed: Seed of the draws.
-        out: Directory of the morphs; new or empty.
-        units: Unit of length of the meshes.
-        manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
-            of the meshes]
-    """
-    from drakegrasp.objects.morph import morph_meshes
-
-    how: Any = {"per_mesh": per_mesh, "seed": seed, "units": units, "manifest": manifest}
-    with progress_bar("morph", "morphs") as progress:
-        report = morph_meshes(mesh_dir, out, **how, progress=progress)
-    for reason in report.refused:
-        say(f"no morphs of {reason}", err=True)
-    for name, count in report.crossing.items():
-        faces = counted(count, "face")
-        say(f"{name} passes through itself in {faces}, and so do its morphs", err=True)
-    share = report.first_draws / report.morphs
-    say(f"{counted(report.morphs, 'morph')} in {out}; {share:.0%} by the first draw")
 
 
 @hand.command(name="list")

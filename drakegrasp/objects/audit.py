@@ -14,7 +14,7 @@ from drakegrasp.config import ways_to_grasps
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
-from drakegrasp.mesh.crossings import crossing_faces, first_hits
+from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import (
     Faces,
     diagonal,
@@ -50,8 +50,6 @@ DENSITIES = (20.0, 8000.0)
 #: Radii of gyration of real objects, as fractions of that of their hull; sheets and shells have
 #: larger ones.
 GYRATION = (0.5, 2.0)
-#: Number of faces up to which self-intersections are searched; more would take minutes.
-MOST_CROSSED = 60_000
 #: Number of points among which two opposed sides are searched, and the factor by which the distance
 #: of two such points may exceed that of the sides, since they are not exactly opposite.
 SIDE_POINTS, SIDE_SLACK = 500, 1.1
@@ -85,7 +83,6 @@ class AuditRow:
             with the given unit; None if it does, or if no unit fits.
         volume: Volume of the solid [m^3].
         volume_change: Volume that repair added to that within the file's faces, as a fraction.
-        crossing: Number of faces of the solid that pass through others.
         wall: Thickness [m] that 95 % of the walls have.
         mass: Mass of the object [kg].
         density: Density of the object [kg/m^3].
@@ -110,7 +107,6 @@ class AuditRow:
     units_guess: str | None = None
     volume: float | None = None
     volume_change: float | None = None
-    crossing: int | None = None
     wall: float | None = None
     mass: float | None = None
     density: float | None = None
@@ -260,7 +256,6 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
         "extents": (x, y, z),
         "volume": model.volume,
         "volume_change": model.volume / before - 1.0 if model.notes and before > 0.0 else 0.0,
-        "crossing": len(crossing_faces(own, solid)) if len(solid) <= MOST_CROSSED else None,
         "wall": wall_thickness(own, solid),
         "width": least_width(own, solid),
         "mass": model.mass,
@@ -295,8 +290,6 @@ def _warnings(row: AuditRow, opening: float, height: float, width: float) -> Ite
         yield f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density"
     if row.gyration is not None and not GYRATION[0] <= row.gyration <= GYRATION[1]:
         yield f"its inertia is {row.gyration**2:.2g} times that of its hull"
-    if row.crossing:
-        yield f"{row.crossing} faces pass through others"
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:
         yield f"repair changed the volume by {row.volume_change:+.0%}"
 

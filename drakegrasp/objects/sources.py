@@ -17,8 +17,8 @@ licence of the meshes, and properties that a file of triangles cannot specify:
       7_scan: {scale: 1.02, up: +y, density: 700}
       8_scan_bent: {group: 7_scan}
 
-Objects of a group come from one mesh, as morphs do: a split by object keeps them together. The
-group of an object that names none is its own name.
+Objects of a group are variants of one mesh: a split by object keeps them together. The group of an
+object that names none is its own name.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from drakegrasp.config import CandidateConfig, Config, is_own_class
 from drakegrasp.errors import ConfigError, HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.finger_sweep import has_paths
-from drakegrasp.mesh.crossings import first_hits
+from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.registry import own_class, run_own

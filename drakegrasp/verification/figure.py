@@ -22,7 +22,7 @@ from pydrake.geometry import LightParameter, Meshcat
 
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import load_hand
-from drakegrasp.mesh.crossings import first_hits
+from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.recording import (

@@ -223,7 +223,7 @@ def test_a_reader_that_closes_the_pipe_sees_no_error() -> None:
 
 
 def test_help_fits_into_80_columns_and_is_not_cut() -> None:
-    groups = {"objects": ("list", "export", "morph"), "hand": ("list", "new", "check")}
+    groups = {"objects": ("list", "export"), "hand": ("list", "new", "check")}
     pages = [
         [],
         *(
@@ -440,18 +440,6 @@ def test_audit_writes_findings_and_a_sheet(tmp_path: Path) -> None:
     left, right = picture[high // 2 :, : wide // 2], picture[high // 2 :, wide // 2 :]
     assert np.ptp(left, axis=2).max() > 0.3
     assert np.ptp(right, axis=2).max() < 0.3
-
-
-def test_morphs_are_told_and_bad_directories_are_refused(tmp_path: Path) -> None:
-    meshes, out = tmp_path / "m", tmp_path / "out"
-    meshes.mkdir()
-    trimesh.creation.box([0.05, 0.06, 0.07]).export(meshes / "1_box_a.obj")
-    result = run("objects", "morph", meshes, "--per-mesh", 2, "--out", out)
-    assert result.exit_code == 0
-    assert result.stdout.startswith(f"2 morphs in {out}; ")
-    again = run("objects", "morph", meshes, "--per-mesh", 2, "--out", out)
-    assert again.exit_code != 0
-    assert "must be new or an empty directory" in error_line(again)
 
 
 # Verify
