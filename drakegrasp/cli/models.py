@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import drakegrasp as dg
-from drakegrasp.cli.arguments import AnyPath, Count, File, Folder, Name, NewFile, Positive, Units
+from drakegrasp.cli.arguments import AnyPath, Count, File, Folder, Name, NewFile, Units
 from drakegrasp.cli.console import UsageError, progress_bar, say, say_finding
 from drakegrasp.cli.help import new_group
 from drakegrasp.errors import counted
@@ -50,7 +50,7 @@ def audit(
         json_file: Write all findings as JSON.
         sheet: Write a picture of every object with its status (.png).
     """
-    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
+    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console
     from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import atomic_path, write_atomic
@@ -62,8 +62,6 @@ def audit(
     console = make_console()
     console.print(audit_table(rows, compact=console.width < ROOMY))
     say(audit_line(rows))
-    if line := memory_line(rows):
-        say(line)
 
     if json_file is not None:
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)

@@ -36,7 +36,6 @@ from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
 from drakegrasp.objects.audit import AuditRow
-from drakegrasp.objects.model import needed_limit
 from drakegrasp.outcomes import GROUPS, Outcome
 
 if TYPE_CHECKING:
@@ -239,8 +238,6 @@ _AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
     ("water-\ntight", lambda row: {True: "yes", False: "no", None: "-"}[row.watertight], False),
     ("wall\n[mm]", lambda row: _number(row.wall, ".1f", 1e3), False),
     ("contact\n[mm]", lambda row: _number(row.collision_error, ".1f", 1e3), False),
-    ("memory\n[MB]", lambda row: _number(row.memory, ".0f", 1e-6), False),
-    ("prepare\n[MB]", lambda row: _number(row.preparing, ".0f", 1e-6), False),
 )
 
 
@@ -286,19 +283,6 @@ def audit_line(rows: Sequence[AuditRow]) -> str:
     told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
     warned = sum(bool(row.warnings) for row in rows)
     return f"{counted(len(rows), 'mesh', 'meshes')}: {told}; {warned} with a warning (!)"
-
-
-def memory_line(rows: Sequence[AuditRow]) -> str:
-    """Return the memory to prepare the largest mesh, as a line; empty if no mesh can be read."""
-    known = {row.name: row.preparing for row in rows if row.preparing is not None}
-    if not known:
-        return ""
-    largest = max(known, key=lambda name: known[name])
-    limit = needed_limit(known[largest])
-    return (
-        f"preparing takes up to {known[largest] / 1e6:.0f} MB of a worker ({printable(largest)}): "
-        f"--memory must be {limit / 1e6:.0f}MB or more"
-    )
 
 
 def verdict_table(results: Sequence[Verification]) -> Table:

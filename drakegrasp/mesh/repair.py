@@ -26,7 +26,6 @@ from drakegrasp.mesh.components import (
     face_components,
     find_components,
     pair_half_edges,
-    part_touching_edges,
 )
 from drakegrasp.mesh.surfaces import (
     Faces,
@@ -140,23 +139,8 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
     Raises:
         MeshError: If the surface cannot become a solid without inventing shape.
     """
-    try:
-        return _repair(vertices, faces, [])
-    except MeshError as reason:
-        # Scans touch themselves along edges, where rims then cross: part these edges and try again.
-        touching = int((edge_ids(faces)[1] > 2).sum())
-        if not touching:
-            raise
-        note = f"the surface touched itself along {touching} edges and was parted there"
-        try:
-            return _repair(*part_touching_edges(vertices, faces), [note])
-        except MeshError:
-            raise reason from None
-
-
-def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
     # Make one surface, while neighbours are still known.
-    size = diagonal(vertices)
+    size, notes = diagonal(vertices), list[str]()
     vertices, faces = _stitch(vertices, faces, notes)
     faces, walls = _drop_inner_walls(vertices, faces)
     total = float(face_areas(vertices, faces).sum())

@@ -24,7 +24,7 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
     unit_normals,
 )
-from drakegrasp.objects.model import AHEAD, ObjectModel, forecast_memory, prepare_object
+from drakegrasp.objects.model import AHEAD, ObjectModel, prepare_object
 from drakegrasp.objects.sources import (
     UNITS,
     MeshSource,
@@ -60,9 +60,6 @@ OPPOSED = -0.3
 LOW_SHARE = 0.85
 #: Fraction of the volume that a repair may change without a warning.
 NOTED_CHANGE = 0.02
-#: Memory of scenes, distances and renderer [B]: for any object, per face of the contact mesh, and
-#: per face of the solid; measured on spheres of 1,280 to 20,480 faces.
-BASE_MEMORY, COLLISION_MEMORY, VISUAL_MEMORY = 98e6, 5.3e3, 0.3e3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +86,6 @@ class AuditRow:
         gyration: Radius of gyration over that of the convex hull.
         collision_faces: Number of faces for contact.
         collision_error: Largest distance of these faces from the solid [m].
-        memory: Memory of a worker for this object, besides its usual memory [B].
-        preparing: Maximum total memory of a worker while it prepares the mesh [B].
         width: Smallest distance of two opposed sides [m], see `least_width`.
         model: The object.
     """
@@ -113,8 +108,6 @@ class AuditRow:
     gyration: float | None = None
     collision_faces: int | None = None
     collision_error: float | None = None
-    memory: float | None = None
-    preparing: float | None = None
     width: float | None = None
     model: ObjectModel | None = field(default=None, repr=False, compare=False)
 
@@ -169,7 +162,6 @@ def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) ->
     pieces, _ = face_components(pair_half_edges(vertices, faces, radial=False), len(faces))
     known |= {
         "faces": len(faces),
-        "preparing": forecast_memory(len(faces)),
         "bodies": pieces,
         "watertight": is_solid_surface(faces),
         "extents": (x, y, z),
@@ -263,9 +255,6 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
         "gyration": float(np.sqrt(np.trace(model.I_OOcm_O) / model.mass / np.trace(round_hull))),
         "collision_faces": len(model.collision_faces),
         "collision_error": model.collision_error,
-        "memory": BASE_MEMORY
-        + COLLISION_MEMORY * len(model.collision_faces)
-        + VISUAL_MEMORY * len(solid),
     }
 
 
