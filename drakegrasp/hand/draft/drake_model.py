@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
+from xml.sax.saxutils import escape, unescape
 
 import numpy as np
 from pydrake.geometry import Role, SceneGraph
@@ -26,7 +27,7 @@ from drakegrasp.errors import HandError, first_line, one_line
 from drakegrasp.foreign_files import read_content
 from drakegrasp.hand.draft.shapes import Shape, read_mesh, read_shape
 from drakegrasp.hand.draft.vendor import Link, VendorJoint, VendorModel
-from drakegrasp.hand.files import rewritten
+from drakegrasp.hand.files import REFERENCES
 from drakegrasp.hand.parsing import (
     declared_efforts,
     declared_masses,
@@ -84,7 +85,7 @@ def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
         def convert(uri: str, is_geometry: bool) -> str:
             return _convert(uri, path.parent, find, copy.parent, meshes) if is_geometry else uri
 
-        text = rewritten(text, convert)
+        text = _rewritten(text, convert)
         copy.write_bytes(text)
         instance, notes = _parse(plant, copy)
 
@@ -141,6 +142,28 @@ def _text_of(path: Path) -> tuple[bytes, Element]:
         return text, ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
+
+
+def _rewritten(model: bytes, place: Callable[[str, bool], str]) -> bytes:
+    """Return the text of a model with each reference replaced.
+
+    Args:
+        model: The text.
+        place: Returns the replacement of a reference. Its arguments are the reference and whether
+            it is geometry. If the replacement equals the reference, the bytes do not change.
+    """
+
+    def replaced(match: re.Match[bytes]) -> bytes:
+        kind = str(match.lastgroup)
+        uri = unescape(match[kind].decode(errors="surrogateescape"))
+        new = place(uri, kind in ("uri", "mesh"))
+        if new == uri:
+            return match[0]
+        start, stop = (position - match.start() for position in match.span(kind))
+        written = escape(new).encode(errors="surrogateescape")
+        return match[0][:start] + written + match[0][stop:]
+
+    return REFERENCES.sub(replaced, model)
 
 
 def _convert(
