@@ -6,7 +6,7 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -30,7 +30,6 @@ def audit(
     *,
     units: Units = "m",
     manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
-    hand: Annotated[str | None, Parameter(metavar="NAME|YAML")] = None,
     json_file: Annotated[NewFile | None, Parameter(name="--json")] = None,
     sheet: NewFile | None = None,
 ) -> None:
@@ -45,20 +44,15 @@ def audit(
         units: Unit of length of the meshes.
         manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
             of the meshes]
-        hand: Hand whose opening and stand-offs are compared with the objects' sizes. [default:
-            barrett]
         json_file: Write all findings as JSON.
         sheet: Write a picture of every object with its status (.png).
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console
-    from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import atomic_path, write_atomic
 
-    own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"] if hand else []).hand_source)
-    limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
     with progress_bar("audit", "meshes") as progress:
-        rows = audit_meshes(mesh_dir, units=units, manifest=manifest, **limits, progress=progress)
+        rows = audit_meshes(mesh_dir, units=units, manifest=manifest, progress=progress)
     console = make_console()
     console.print(audit_table(rows, compact=console.width < ROOMY))
     say(audit_line(rows))
@@ -121,46 +115,35 @@ def new_hand(
     *,
     out: Folder,
     palm: Annotated[str | None, Parameter(metavar="LINK")] = None,
-    approach: Annotated[str | None, Parameter(metavar="X,Y,Z", allow_leading_hyphen=True)] = None,
     fingers: Annotated[str | None, Parameter(metavar="LINK,LINK")] = None,
     joints: Annotated[tuple[str, ...], Parameter(name="--joint", metavar="NAME=POSITION")] = (),
-    reverse: Annotated[tuple[str, ...], Parameter(metavar="JOINT")] = (),
     effort: Annotated[float | None, Parameter(metavar="E", validator=Number(gt=0.0))] = None,
-    settings: Annotated[tuple[str, ...], Parameter(name="--set", metavar="KEY=VALUE")] = (),
     packages: Annotated[tuple[str, ...], Parameter(name="--package", metavar="NAME=FOLDER")] = (),
 ) -> None:
     """Draft a hand file from a model, and draw it.
 
-    MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. The command writes the hand file,
-    in which each guess has a comment, the model, its meshes and a picture to DIR. Options override
-    guesses. The exit code is 1 if a check of the drafted hand fails.
+    MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. The command writes a hand
+    file, the model, its meshes and a picture to DIR. Options override guesses. The exit code is 1
+    if a check of the drafted hand fails.
 
     Args:
         model: The model of the hand.
         out: A new folder for the hand's files.
         palm: The link from which the fingers branch.
-        approach: Direction that the palm faces: +Gz, in the axes of the palm link.
         fingers: The fingertip links of the grasping fingers.
         joints: The position of a joint that does not close [rad or m], as in the vendor's model.
-        reverse: A joint whose positive position opens the hand.
         effort: Largest effort of each motor at its joint [N m, or N].
-        settings: A key of the hand file, as in --set drive=torque.
         packages: Folder of package://NAME/.
     """
-    import numpy as np
-
     from drakegrasp.hand.draft.fingers import Answers
     from drakegrasp.hand_setup.new import draft_hand
 
     # The user's answers.
     answers = Answers(
-        approach=None if approach is None else np.array(_direction(approach)),
         fingers=tuple(fingers.split(",")) if fingers else (),
         joints={name: _number(text) for name, text in _pairs("--joint", joints)},
         palm=palm,
-        reverse=reverse,
         effort=effort,
-        settings=settings,
     )
     folders = {name: Path(text) for name, text in _pairs("--package", packages)}
     drafted = draft_hand(model, out, answers=answers, packages=folders)
@@ -196,13 +179,6 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise UsageError(f"must be a number, got {text!r}") from None
-
-
-def _direction(text: str) -> list[float]:
-    numbers = [_number(part) for part in text.split(",")]
-    if len(numbers) != 3 or not any(numbers):
-        raise UsageError(f"--approach must be X,Y,Z, not all zero, got {text!r}")
-    return numbers
 
 
 @hand.command(name="check")

@@ -9,9 +9,7 @@ from __future__ import annotations
 import codecs
 import io
 import logging
-import re
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +27,6 @@ from drakegrasp.mesh.surfaces import Faces, stack, unit_normals
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 #: Largest valid coordinate, in any unit: beyond it, squares and single precision overflow.
 LARGEST = 1e9
-#: Number of faces from which on the memory of reading a file is freed at once: a scene of trimesh
-#: refers to itself, so it would wait for Python's garbage collector.
-MANY_FACES = 100_000
 #: Fraction of its diagonal by which a part may differ from the bounds that the file states for it.
 BOUNDS = 1e-3
 #: Two faces with an edge in common lie on each other if the cosine of the angle between their
@@ -40,21 +35,8 @@ FOLDED = -0.9998
 #: A triangle has no area if twice its area is below this fraction of its longest side squared, and
 #: the largest number of such triangles that lie side by side in a polygon.
 FLAT, FLAT_STEPS = 1e-6, 8
-#: What names the materials of a Wavefront file.
-_MATERIALS = rb"^mtllib[ \t]+(.*\S)"
 #: What NumPy says, in a warning or an error, when it stops at a word that is not a number.
 _NO_NUMBER = "string or file could not be read"
-
-
-def load_mesh(path: str | Path) -> trimesh.Trimesh:
-    """Return the triangles of a mesh file, in the file's units and axes.
-
-    Raises:
-        MeshError: If the file cannot be read or contains no finite triangles.
-    """
-    path = Path(path)
-    vertices, faces = parse_mesh(path.name, read_bytes(path))
-    return clean_triangles(vertices, faces, path.name)
 
 
 def load_points(path: Path) -> Array:
@@ -69,20 +51,15 @@ def load_points(path: Path) -> Array:
     return np.asarray(clouds[0].vertices, dtype=np.float64)
 
 
-def load_scene(path: Path) -> trimesh.Scene:
-    """Return the geometries of a mesh file with their materials; `join_scene` makes one mesh.
+def load_surface(path: Path) -> tuple[Array, Faces]:
+    """Return the triangles of a mesh file of any format, in the file's units and axes.
 
     Raises:
         MeshError: If the file cannot be read or contains no finite triangles.
     """
-    # A Wavefront file names its materials; those of other folders are not read.
-    content = read_bytes(path)
-    names = {name.decode(errors="replace") for name in re.findall(_MATERIALS, content, re.M)}
-    files = [path.with_name(name) for name in names if name == Path(name).name]
-    materials = {file.name: read_bytes(file) for file in files if file.is_file()}
-    scene = _parse_scene(path.name, content, materials)
-    refuse_faulty(*join_scene(scene), path.name)
-    return scene
+    vertices, faces = join_scene(_parse_scene(path.name, read_bytes(path)))
+    refuse_faulty(vertices, faces, path.name)
+    return vertices, faces
 
 
 def read_bytes(path: Path) -> bytes:
@@ -118,15 +95,14 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
     return join_scene(_parse_scene(name, content))
 
 
-def _parse_scene(
-    name: str, content: bytes, materials: Mapping[str, bytes] | None = None
-) -> trimesh.Scene:
+def _parse_scene(name: str, content: bytes) -> trimesh.Scene:
     """Return what trimesh reads from a mesh file, if it is what the file declares.
+
+    Materials are not read.
 
     Args:
         name: Name of the file; its suffix determines the format.
         content: The file's bytes.
-        materials: Files of materials by name; if None, materials are not read.
 
     Raises:
         MeshError: As `parse_mesh`.
@@ -142,7 +118,7 @@ def _parse_scene(
     content = content.removeprefix(codecs.BOM_UTF8)
     try:
         declared = declare(content)
-        scene = _read_by_trimesh(suffix[1:], content, materials)
+        scene = _read_by_trimesh(suffix[1:], content)
         _refuse_difference(scene, declared)
     except ImportError as error:
         missing = "pycollada" if suffix == ".dae" else one_line(error)
@@ -154,18 +130,12 @@ def _parse_scene(
     return scene
 
 
-def _read_by_trimesh(
-    kind: str, content: bytes, materials: Mapping[str, bytes] | None
-) -> trimesh.Scene:
+def _read_by_trimesh(kind: str, content: bytes) -> trimesh.Scene:
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.filterwarnings("error", message=_NO_NUMBER)
         return trimesh.load_scene(
-            io.BytesIO(content),
-            file_type=kind,
-            process=False,
-            skip_materials=materials is None,
-            resolver=materials,
+            io.BytesIO(content), file_type=kind, process=False, skip_materials=True
         )
 
 

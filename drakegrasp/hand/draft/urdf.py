@@ -71,14 +71,20 @@ def _add_link(robot: Element, link: Link, stem: str, folder: Path) -> None:
     pairs = combinations_with_replacement(range(3), 2)
     _add(inertial, "inertia", **{f"i{'xyz'[a]}{'xyz'[b]}": tensor[a, b] for a, b in pairs})
 
-    # Shapes; meshes are separate files.
-    for tag, shapes in (("collision", link.collisions), ("visual", link.visuals)):
-        for n, shape in enumerate(shapes):
-            _add_shape(element, tag, shape, f"{stem}_{tag}_{n}", folder)
+    # Shapes, which are drawn as they collide; meshes are separate files.
+    for n, shape in enumerate(link.collisions):
+        name = f"{stem}_{n}"
+        if shape.vertices is not None and shape.faces is not None:
+            text = obj_text(shape.vertices, shape.faces, normals=True)
+            (folder / MESHES / f"{name}.obj").write_text(text, encoding="utf-8")
+        for tag in ("collision", "visual"):
+            mesh = _add_shape(element, tag, shape, name)
+            if tag == "collision" and mesh is not None:
+                _add(mesh, "drake:declare_convex")
 
 
-def _add_shape(parent: Element, tag: str, shape: Shape, name: str, folder: Path) -> None:
-    """Add a shape; a mesh becomes a file."""
+def _add_shape(parent: Element, tag: str, shape: Shape, name: str) -> Element | None:
+    """Add a shape; return the element of a mesh."""
     element = _add(parent, tag, name=name)
     _add_origin(element, shape.X_LS)
     geometry, own = _add(element, "geometry"), shape.primitive
@@ -90,18 +96,8 @@ def _add_shape(parent: Element, tag: str, shape: Shape, name: str, folder: Path)
         kind = "cylinder" if isinstance(own, Cylinder) else "drake:capsule"
         _add(geometry, kind, radius=own.radius(), length=own.length())
     else:
-        assert shape.vertices is not None and shape.faces is not None
-        file = f"{MESHES}/{name}.obj"
-        text = obj_text(shape.vertices, shape.faces, normals=tag == "visual")
-        (folder / file).write_text(text, encoding="utf-8")
-        mesh = _add(geometry, "mesh", filename=file)
-        if tag == "collision":
-            _add(mesh, "drake:declare_convex")
-
-    # Only visual shapes have a colour.
-    if tag == "visual" and shape.colour is not None:
-        material = _add(element, "material", name=f"{name}_colour")
-        _add(material, "color", rgba=np.array([*shape.colour, 1.0]))
+        return _add(geometry, "mesh", filename=f"{MESHES}/{name}.obj")
+    return None
 
 
 def _add_joint(robot: Element, joint: VendorJoint, mimic: Mimic | None) -> None:

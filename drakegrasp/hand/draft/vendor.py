@@ -8,7 +8,7 @@ link is the frame of the joint that carries it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,9 +26,6 @@ ENDLESS = np.array([-np.inf, np.inf])
 ROOM = 0.5
 #: Smallest and largest size of a hand, including an arm [m]; other sizes mean other units.
 SIZES = (0.03, 3.0)
-#: Smallest and largest limit of joints that turn [rad], and range of masses of a hand, including an
-#: arm [kg]; other values mean other units.
-SMALLEST_TURN, LARGEST_TURN, MASSES = 0.1, 2.0 * np.pi, (0.01, 60.0)
 #: Mass [kg] and radius [m] of a moving link that has neither mass nor shape.
 BARE_MASS, BARE_RADIUS = 1e-3, 0.016
 
@@ -41,14 +38,14 @@ class Link:
         name: Name of the link.
         inertia: M_LLo_L; zero for a body whose model gives none, before it is welded.
         collisions: Collision shapes; convex after welding.
-        visuals: Shapes that are drawn.
+        pictures: Shapes that are drawn, of a body that has no others; empty after welding.
         impossible: What is wrong with the inertia of its model; empty if nothing is.
     """
 
     name: str
     inertia: SpatialInertia
     collisions: tuple[Shape, ...] = ()
-    visuals: tuple[Shape, ...] = ()
+    pictures: tuple[Shape, ...] = ()
     impossible: str = ""
 
     def corners(self) -> Array:
@@ -56,9 +53,9 @@ class Link:
         return np.concatenate([np.zeros((0, 3)), *[s.corners() for s in self.collisions]])
 
     @property
-    def weight(self) -> tuple[float, int, int]:
+    def weight(self) -> tuple[float, int]:
         """Rank of the link among those welded to it: the highest gives its name to all."""
-        return self.inertia.get_mass(), len(self.collisions), len(self.visuals)
+        return self.inertia.get_mass(), len(self.collisions)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -275,13 +272,13 @@ def _weld(members: Sequence[tuple[Link, Array]]) -> tuple[Link, list[str]]:
     """Return the link of bodies with poses (4, 4) in its frame, and notes of what was added."""
     # Join the shapes; without collision shapes, the visual shapes also collide.
     name, notes = max((body for body, _ in members), key=lambda body: body.weight).name, []
-    solids, visuals = (
+    solids, pictures = (
         [replace(s, X_LS=X_LB @ s.X_LS) for body, X_LB in members for s in getattr(body, kind)]
-        for kind in ("collisions", "visuals")
+        for kind in ("collisions", "pictures")
     )
-    if visuals and not solids:
+    if pictures and not solids:
         notes.append(f"link {name}: the model has no collision shapes; hulls of its pictures")
-    collisions = [shape.hull() for shape in solids or visuals]
+    collisions = [shape.hull() for shape in solids or pictures]
 
     # Add the inertias about the link's origin.
     total = SpatialInertia.Zero()
@@ -303,8 +300,7 @@ def _weld(members: Sequence[tuple[Link, Array]]) -> tuple[Link, list[str]]:
         )
         likely = solid_inertia(collisions) if collisions else ball
         total = SpatialInertia(total.get_mass(), likely.get_com(), likely.get_unit_inertia())
-    drawn = tuple(shape.simplified() for shape in visuals)
-    return Link(name=name, inertia=total, collisions=tuple(collisions), visuals=drawn), notes
+    return Link(name=name, inertia=total, collisions=tuple(collisions)), notes
 
 
 def _leaders(given: Mapping[str, Mimic], joints: Mapping[str, VendorJoint]) -> dict[str, Mimic]:
@@ -344,25 +340,6 @@ def _leaders(given: Mapping[str, Mimic], joints: Mapping[str, VendorJoint]) -> d
                 f"{lower:g}..{upper:g}"
             )
     return found
-
-
-def doubtful_units(model: VendorModel) -> Iterator[str]:
-    """Yield doubts about a model whose angles or masses no hand has: its units may be others."""
-    turning = [joint.limits for joint in model.joints.values() if not joint.slides]
-    angles = np.abs([limits for limits in turning if np.isfinite(limits).all()])
-    if angles.size and np.median(angles.max(axis=1)) > LARGEST_TURN:
-        yield (
-            f"its joints turn up to {angles.max():.4g} rad: are its limits in degrees? They must "
-            "be in radians"
-        )
-    if angles.size and angles.max() < SMALLEST_TURN:
-        yield (
-            f"its joints turn up to {np.rad2deg(angles.max()):.2g} degrees: are its angles in "
-            'radians? MJCF says so by <compiler angle="radian"/>'
-        )
-    mass = sum(link.inertia.get_mass() for link in model.links.values())
-    if not MASSES[0] <= mass <= MASSES[1]:
-        yield f"its masses are {mass:.3g} kg in all: are they in another unit? They must be in kg"
 
 
 def _refuse_size(model: VendorModel) -> None:
