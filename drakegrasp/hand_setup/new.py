@@ -35,8 +35,7 @@ from drakegrasp.hand.draft.grips import Grip, find_grips, trace_finger
 from drakegrasp.hand.draft.hand_file import Draft, draft_file, positions
 from drakegrasp.hand.draft.palm import find_palm_frames
 from drakegrasp.hand.draft.source import read_model
-from drakegrasp.hand.draft.urdf import write_urdf
-from drakegrasp.hand.draft.vendor import VendorModel
+from drakegrasp.hand.draft.vendor import VendorModel, write_urdf
 from drakegrasp.hand.parsing import ModelFile
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand_setup.check import GRASPS, check_grasp

@@ -24,12 +24,12 @@ from pydrake.systems.framework import DiagramBuilder
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
 from drakegrasp.hand import folder
+from drakegrasp.hand.checks import overlap_query
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Coupling
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
-from drakegrasp.hand.overlaps import overlap_query
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import link_shapes
 
