@@ -17,7 +17,7 @@ from drakegrasp.cli.help import OPTIONS, new_group
 #: The commands in the order of the help: functions or groups, and the first lines of their help.
 COMMANDS = {
     "doctor": ("doctor:doctor", "Check that this machine can run drakegrasp."),
-    "objects": ("models:objects", "List or export the built-in objects, or make morphs of meshes."),
+    "objects": ("models:objects", "List or export the built-in objects."),
     "audit": ("models:audit", "Check which meshes are fit, repaired or refused."),
     "hand": ("models:hand", "List the hands, draft a hand file, or check a hand."),
     "build": ("build:build", "Build a dataset from a directory of meshes."),

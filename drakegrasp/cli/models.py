@@ -7,13 +7,13 @@ import math
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import drakegrasp as dg
-from drakegrasp.cli.arguments import AnyPath, Count, File, Folder, Name, NewFile, Positive, Units
+from drakegrasp.cli.arguments import AnyPath, Count, File, Folder, Name, NewFile, Units
 from drakegrasp.cli.console import UsageError, progress_bar, say, say_finding
 from drakegrasp.cli.help import new_group
 from drakegrasp.errors import counted
@@ -21,7 +21,7 @@ from drakegrasp.errors import counted
 if TYPE_CHECKING:
     from drakegrasp.hand.checks import Finding
 
-objects = new_group("objects", "List or export the built-in objects, or make morphs of meshes.")
+objects = new_group("objects", "List or export the built-in objects.")
 hand = new_group("hand", "List the hands, draft a hand file, or check a hand.")
 
 
@@ -31,7 +31,6 @@ def audit(
     *,
     units: Units = "m",
     manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
-    hand: Annotated[str | None, Parameter(metavar="NAME|YAML")] = None,
     json_file: Annotated[NewFile | None, Parameter(name="--json")] = None,
 ) -> None:
     """Check which meshes are fit, repaired or refused.
@@ -45,18 +44,13 @@ def audit(
         units: Unit of length of the meshes.
         manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
             of the meshes]
-        hand: Hand whose opening and stand-offs are compared with the objects' sizes. [default:
-            barrett]
         json_file: Write all findings as JSON.
     """
-    from drakegrasp.hand.kinematics import flat_limits, opening
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import write_atomic
 
-    own = dg.load_hand(dg.load_config(overrides=[f"hand={hand}"] if hand else []).hand_source)
-    limits: Any = {"opening": opening(own), "flat": flat_limits(own)}
     with progress_bar("audit", "meshes") as progress:
-        rows = audit_meshes(mesh_dir, units=units, manifest=manifest, **limits, progress=progress)
+        rows = audit_meshes(mesh_dir, units=units, manifest=manifest, progress=progress)
     for row in rows:
         words = "; ".join([*row.notes, *(f"! {text}" for text in row.warnings)])
         say(f"{row.status:<9} {row.name}{': ' * bool(words)}{words}")
@@ -101,46 +95,6 @@ def export_objects(directory: Folder, /, *, per_class: Count = 2, objects_seed: 
     say(f"{counted(len(paths), 'mesh', 'meshes')} in {directory}")
 
 
-@objects.command(name="morph")
-def morph_objects(
-    mesh_dir: Folder,
-    /,
-    *,
-    per_mesh: Positive,
-    seed: Annotated[Count, Parameter(validator=Number(gte=0))] = 0,
-    out: Folder,
-    units: Units = "m",
-    manifest: Annotated[AnyPath | None, Parameter(metavar="FILE")] = None,
-) -> None:
-    """Create objects with other proportions from meshes.
-
-    Each mesh of MESH_DIR is widened, narrowed and stretched along a random axis. The morphs (.obj,
-    metres, +z up) stand on the table like the mesh, and an objects.yaml in DIR keeps their classes.
-    The same seed writes the same files.
-
-    Args:
-        mesh_dir: Directory of meshes.
-        per_mesh: Number of morphs of each mesh.
-        seed: Seed of the draws.
-        out: Directory of the morphs; new or empty.
-        units: Unit of length of the meshes.
-        manifest: YAML file with units and classes by mesh. [default: objects.yaml in the directory
-            of the meshes]
-    """
-    from drakegrasp.objects.morph import morph_meshes
-
-    how: Any = {"per_mesh": per_mesh, "seed": seed, "units": units, "manifest": manifest}
-    with progress_bar("morph", "morphs") as progress:
-        report = morph_meshes(mesh_dir, out, **how, progress=progress)
-    for reason in report.refused:
-        say(f"no morphs of {reason}", err=True)
-    for name, count in report.crossing.items():
-        faces = counted(count, "face")
-        say(f"{name} passes through itself in {faces}, and so do its morphs", err=True)
-    share = report.first_draws / report.morphs
-    say(f"{counted(report.morphs, 'morph')} in {out}; {share:.0%} by the first draw")
-
-
 @hand.command(name="list")
 def list_hands() -> None:
     """Print the names of the hands that come with the package."""
@@ -157,46 +111,35 @@ def new_hand(
     *,
     out: Folder,
     palm: Annotated[str | None, Parameter(metavar="LINK")] = None,
-    approach: Annotated[str | None, Parameter(metavar="X,Y,Z", allow_leading_hyphen=True)] = None,
     fingers: Annotated[str | None, Parameter(metavar="LINK,LINK")] = None,
     joints: Annotated[tuple[str, ...], Parameter(name="--joint", metavar="NAME=POSITION")] = (),
-    reverse: Annotated[tuple[str, ...], Parameter(metavar="JOINT")] = (),
     effort: Annotated[float | None, Parameter(metavar="E", validator=Number(gt=0.0))] = None,
-    settings: Annotated[tuple[str, ...], Parameter(name="--set", metavar="KEY=VALUE")] = (),
     packages: Annotated[tuple[str, ...], Parameter(name="--package", metavar="NAME=FOLDER")] = (),
 ) -> None:
     """Draft a hand file from a model, and draw it.
 
-    MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. The command writes the hand file,
-    in which each guess has a comment, the model, its meshes and a picture to DIR. Options override
-    guesses. The exit code is 1 if a check of the drafted hand fails.
+    MODEL is a URDF, SDFormat or MJCF file as its vendor ships it. The command writes a hand
+    file, the model, its meshes and a picture to DIR. Options override guesses. The exit code is 1
+    if a check of the drafted hand fails.
 
     Args:
         model: The model of the hand.
         out: A new folder for the hand's files.
         palm: The link from which the fingers branch.
-        approach: Direction that the palm faces: +Gz, in the axes of the palm link.
         fingers: The fingertip links of the grasping fingers.
         joints: The position of a joint that does not close [rad or m], as in the vendor's model.
-        reverse: A joint whose positive position opens the hand.
         effort: Largest effort of each motor at its joint [N m, or N].
-        settings: A key of the hand file, as in --set drive=torque.
         packages: Folder of package://NAME/.
     """
-    import numpy as np
-
     from drakegrasp.hand.draft.fingers import Answers
     from drakegrasp.hand_setup.new import draft_hand
 
     # The user's answers.
     answers = Answers(
-        approach=None if approach is None else np.array(_direction(approach)),
         fingers=tuple(fingers.split(",")) if fingers else (),
         joints={name: _number(text) for name, text in _pairs("--joint", joints)},
         palm=palm,
-        reverse=reverse,
         effort=effort,
-        settings=settings,
     )
     folders = {name: Path(text) for name, text in _pairs("--package", packages)}
     drafted = draft_hand(model, out, answers=answers, packages=folders)
@@ -232,13 +175,6 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise UsageError(f"must be a number, got {text!r}") from None
-
-
-def _direction(text: str) -> list[float]:
-    numbers = [_number(part) for part in text.split(",")]
-    if len(numbers) != 3 or not any(numbers):
-        raise UsageError(f"--approach must be X,Y,Z, not all zero, got {text!r}")
-    return numbers
 
 
 @hand.command(name="check")

@@ -213,7 +213,7 @@ class Manifest:
 
     @property
     def groups(self) -> list[str]:
-        """Group of each object, equal for objects of the same mesh, e.g. its morphs."""
+        """Group of each object, equal for variants of the same mesh."""
         return [entry.group or entry.name for entry in self.objects]
 
     def signature(self) -> str:

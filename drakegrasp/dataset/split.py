@@ -44,7 +44,7 @@ def split_samples(
         objects: (n,), row of /objects of each sample.
         names: Names of the objects' meshes, by row; a mesh with several seeds counts as one object.
         classes: Classes of the objects, by row.
-        groups: Groups of the objects, by row, equal for objects of the same mesh, e.g. its morphs.
+        groups: Groups of the objects, by row, equal for variants of the same mesh.
         homes: Split of each group of a split by object, see `find_homes`.
         config: The rule and the fractions of the splits.
         seed: Seed of the dataset, which draws the split by class.

@@ -6,12 +6,15 @@ files; palm, finger order, pads, and links that collide when the hand closes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import trimesh
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.geometry import QueryObject
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
 from scipy.linalg import block_diag
 
 from drakegrasp.config import Config
@@ -36,13 +39,15 @@ from drakegrasp.hand.kinematics import (
     link_poses,
     still_links,
 )
-from drakegrasp.hand.overlaps import overlap_query
 from drakegrasp.hand.parsing import (
     Mimic,
+    ModelFile,
     add_model,
     declared_masses,
     declared_mimics,
     impossible_inertias,
+    joint_slides,
+    moving_joint,
     read_xml,
 )
 from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces, ray_span
@@ -96,18 +101,18 @@ def judge(name: str, faults: Sequence[str], fine: str) -> Finding:
 
 def check_masses(hand: Hand) -> Finding:
     """Return whether every link has a mass and a physically possible inertia."""
-    # Drake parses the inertias; the masses are read from the text of the file.
+    # Drake replaces what is missing or impossible by its own values, so the text is read.
     root = read_xml(hand.model.path)
-    masses, impossible = declared_masses(root), impossible_inertias(root)
-    plant, faults = MultibodyPlant(0.0), []
-    for index in plant.GetBodyIndices(add_model(plant, hand.model)):
-        body = plant.get_body(index)
-        name, mass = body.name(), masses.get(body.name(), 0.0)
-        if not mass > 0.0:
-            faults.append(f"link {name!r} must have a mass above 0 kg, got {mass:g}")
-        elif name in impossible or not body.default_spatial_inertia().IsPhysicallyValid():
-            got = f", got {impossible[name]}" if name in impossible else ""
-            faults.append(f"link {name!r} must have an inertia that a body can have{got}")
+    masses = declared_masses(root)
+    faults = [
+        f"link {name!r} must have a mass above 0 kg, got {mass:g}"
+        for name, mass in masses.items()
+        if not mass > 0.0
+    ]
+    faults += [
+        f"link {name!r} must have an inertia that a body can have, got {got}"
+        for name, got in impossible_inertias(root).items()
+    ]
     return judge("masses", faults, f"{len(masses)} links, {sum(masses.values()):.3g} kg in all")
 
 
@@ -318,33 +323,16 @@ def check_pads(hand: Hand) -> Finding:
                 f"fingers.{i}.pad_point must lie on the surface of link {finger.fingertip!r}, "
                 f"got one {1e3 * distance:.1f} mm away"
             )
-        if not len(pad):
-            faults.append(f"fingers.{i}.pad_region must hold a part of the surface, got none of it")
-            continue
-
         # The pad must face the direction of its motion, and have room behind its face.
         if facing[i] <= 0.0:
             faults.append(
                 f"the pad of finger {finger.name!r} must face where the finger closes, got its "
-                f"back: {_turned_round(hand, i)}"
+                "back: check the pad_region, and the axis of the closing joint, which must close "
+                "from 0 in the open hand"
             )
         faults += _tight_borders(i, finger, pad)
         areas.append(1e6 * float(trimesh.triangles.area(pad).sum()))
     return judge("pads", faults, f"{', '.join(f'{area:.0f}' for area in areas)} mm²")
-
-
-def _turned_round(hand: Hand, i: int) -> str:
-    """Return how to repair a finger that moves away from its pad's side."""
-    # A joint that opens the hand moves the pad away from those of the other fingers.
-    start = pad_points_at(hand, np.zeros(hand.num_fingers))
-    moved = pad_points_at(hand, 0.1 * closed_positions(hand))
-    others = np.delete(start, i, axis=0).mean(axis=0)
-    if np.linalg.norm(moved[i] - others) <= np.linalg.norm(start[i] - others):
-        return "check the pad_region, and the axis of the closing joint"
-    return (
-        f"a positive position of joint {hand.fingers[i].closing_joint!r} opens the hand: make it "
-        "close from 0 in the open hand, or take `drakegrasp hand new`"
-    )
 
 
 def _tight_borders(i: int, finger: Finger, pad: Array) -> Iterator[str]:
@@ -443,26 +431,88 @@ def check_overlaps(hand: Hand) -> Finding:
 
     In the simulation, other links pass through each other, so they must not touch.
     """
-    # Find the finger whose closing moves each link: 1 for the first finger, 0 for no finger.
-    overlaps, faults = overlap_query(hand.model, hand.palm_link), dict[str, float]()
+    # The finger whose closing moves each link. A link above the palm is not in the palm's tree.
     moves = {link: chain.gain[:, 1:].any(axis=0) for link, chain in hand.link_chains.items()}
-    movers = {link: 1 + int(by.argmax()) if by.any() else 0 for link, by in moves.items()}
+    movers = {link: int(by.argmax()) for link, by in moves.items() if by.any()}
+    postures = (joint_positions(hand, 0.0, closing) for closing in closing_path(hand, POSTURES))
+    query = overlap_query(hand.model, hand.palm_link)
+    texts = [
+        f"links {one!r} and {other!r} must not meet before fingertips do, got {1e3 * depth:.1f} mm "
+        "of overlap"
+        for (one, other), depth in early_overlaps(
+            query, postures, movers, hand.fingertip_links
+        ).items()
+        if depth > OVERLAP
+    ]
+    return judge("self-collision", texts, "fingertips meet before any other links")
 
-    # Close the hand step by step, until two fingertips meet.
-    for closing in closing_path(hand, POSTURES):
+
+#: Names of two links, and how deep one is in the other [m].
+Overlap: TypeAlias = tuple[tuple[str, str], float]
+#: Returns which links overlap at positions of all joints.
+OverlapQuery: TypeAlias = Callable[[Mapping[str, float]], list[Overlap]]
+
+
+def early_overlaps(
+    overlaps: OverlapQuery,
+    postures: Iterable[Mapping[str, float]],
+    movers: Mapping[str, int],
+    tips: Collection[str],
+) -> dict[tuple[str, str], float]:
+    """Return the links of two fingers that overlap before two fingertips do, and how deep [m].
+
+    Args:
+        overlaps: See `overlap_query`.
+        postures: Positions of all joints, from the open hand to the closed one.
+        movers: The finger that moves each link; other links may overlap.
+        tips: The fingertip links.
+    """
+    found: dict[tuple[str, str], float] = {}
+    for posture in postures:
         met = False
-        for links, depth in overlaps(joint_positions(hand, 0.0, closing)):
-            # A link above the palm is not in the palm's tree, and fingers do not move it.
-            one, other = (movers.get(link, 0) for link in links)
-            if not one or not other or one == other:
+        for links, depth in overlaps(posture):
+            if len({movers.get(link) for link in links} - {None}) < 2:
                 continue
-            if set(links) <= set(hand.fingertip_links):
+            if set(links) <= set(tips):
                 met = True
-            elif depth > OVERLAP:
-                key = f"links {links[0]!r} and {links[1]!r}"
-                faults[key] = max(faults.get(key, 0.0), depth)
+            else:
+                found[links] = max(found.get(links, 0.0), depth)
         if met:
             break
-    texts = [f"{key} must not meet before fingertips do, got {1e3 * depth:.1f} mm of overlap"
-             for key, depth in faults.items()]  # fmt: skip
-    return judge("self-collision", texts, "fingertips meet before any other links")
+    return found
+
+
+def overlap_query(model: ModelFile, palm_link: str) -> OverlapQuery:
+    """Return a function of the positions of a hand's joints that returns which links overlap.
+
+    Args:
+        model: The hand's model.
+        palm_link: The link that keeps its place.
+
+    Raises:
+        HandError: If the model cannot be read.
+    """
+    builder = DiagramBuilder()
+    plant, graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    instance = add_model(plant, model)
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(palm_link, instance))
+    plant.Finalize()
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    state, scene = plant.GetMyContextFromRoot(context), graph.GetMyContextFromRoot(context)
+    found = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    joints = [joint for joint in found if moving_joint(joint)]
+
+    def overlaps(positions: Mapping[str, float]) -> list[Overlap]:
+        for joint in joints:
+            place = joint.set_translation if joint_slides(joint) else joint.set_angle
+            place(state, positions[joint.name()])
+        query: QueryObject = graph.get_query_output_port().Eval(scene)
+        pairs = []
+        for pair in query.ComputePointPairPenetration():
+            frames = (query.inspector().GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
+            one, other = (plant.GetBodyFromFrameId(frame).name() for frame in frames)
+            pairs.append(((one, other), pair.depth))
+        return pairs
+
+    return overlaps

@@ -13,8 +13,9 @@ J a joint.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from drakegrasp.hand.file_format import (
     rated_load,
     read_hand_file,
 )
-from drakegrasp.hand.files import find_packages, hand_file
+from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.folder import hand_folder
 from drakegrasp.hand.parsing import (
     KEPT_HANDS,
@@ -214,29 +215,22 @@ def load_hand(source: HandSource = "barrett") -> Hand:
             lacks a link or joint that the YAML file names, or the files of a dataset's hand have
             changed.
     """
-    # Use a cached hand if its files did not change.
-    path = hand_file(source)
-    key = source if isinstance(source, CarriedHand) else path.absolute()
-    known = _loaded.pop(key, None)
-    if known is not None and known[0].model.stamp == _stamp(known[1]):
-        _loaded[key] = known
-        return known[0]
-
-    folder = hand_folder(source)
-    stamp = _stamp(folder.sources)
+    path, folder = hand_file(source), hand_folder(source)
     if isinstance(source, CarriedHand) and folder.digest != source.digest:
         raise HandError(
             f"{path.parent}: must hold the hand of the dataset ({source.digest}), got other files "
             f"({folder.digest})"
         )
-    described, packages = read_hand_file(path), dict[str, Path]()
+    return _load(path.absolute(), folder.stamp)
+
+
+@lru_cache(maxsize=KEPT_HANDS)
+def _load(path: Path, stamp: tuple[int, ...]) -> Hand:
+    """Return the hand of a hand file; parsing takes 40 ms."""
+    described = read_hand_file(path)
+    model = ModelFile(path.parent.resolve() / described.model, stamp)
+    name, shaped = path.stem.removesuffix("_hand"), list[Hand]()
     try:
-        if not isinstance(source, CarriedHand):  # which names no packages
-            own = path.parent.resolve()
-            packages = find_packages(own, described.model, described.packages)
-        place = path.parent.resolve() / described.model
-        model = ModelFile(place, tuple(sorted(packages.items())), stamp)
-        name, shaped = path.stem.removesuffix("_hand"), list[Hand]()
         hand = _build_hand(name, described, model)
         for i, preshape in enumerate(described.preshapes):
             try:
@@ -248,9 +242,6 @@ def load_hand(source: HandSource = "barrett") -> Hand:
         _refuse_empty_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
-    while len(_loaded) >= KEPT_HANDS:
-        _loaded.pop(next(iter(_loaded)))
-    _loaded[key] = hand, folder.sources
     return hand
 
 
@@ -268,16 +259,6 @@ def load_plain_hand(source: HandSource, where: str) -> Hand:
     if hand.preshapes:
         raise HandError(f"hand must be one without preshapes for {where}, got {hand.name}")
     return hand
-
-
-#: Loaded hands with their files, the most recently used last: parsing takes 40 ms.
-_loaded: dict[Path | CarriedHand, tuple[Hand, Collection[Path]]] = {}
-
-
-def _stamp(files: Collection[Path]) -> tuple[int, ...]:
-    """Return sizes [byte] and modification times [ns] of the files that exist."""
-    stats = [path.stat() for path in files if path.exists()]
-    return tuple(number for s in stats for number in (s.st_size, s.st_mtime_ns))
 
 
 def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:

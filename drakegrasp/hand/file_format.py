@@ -233,7 +233,6 @@ class HandFile(BaseModel):
     model_config = _STRICT
     version: int
     model: Name  # the SDFormat or URDF file, relative to the YAML file
-    packages: dict[Name, Name] = {}  # folders of package:// URIs, relative to the YAML file
     palm: Palm
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1)]
     drive: Literal["worm", "torque"] = "torque"

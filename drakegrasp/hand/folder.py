@@ -1,9 +1,8 @@
-"""A folder that holds all files of a hand, and a digest of its content.
+"""The folder that holds all files of a hand, and a digest of its content.
 
-Input: a hand. Output: the content of such a folder: hand file, model, weights, licences, and meshes
-with the files that they name. Files below the hand file keep their places and bytes. The hand file
-and the model are rewritten only where they name something outside the folder or by an absolute path
-or a `package://` URI. The hand in such a folder produces the same folder and digest again.
+Input: a hand. Output: which files it has: hand file, model, weights, licences, and meshes with the
+files that they name. They lie in the folder of the hand file or below it, so that the folder can be
+copied: a file elsewhere is rejected.
 
 A dataset contains such a folder, see `carry_hand`. It is copied at the start of a build and read
 from then on, so that workers and later commands need no other file of the hand. Does not import
@@ -17,37 +16,31 @@ import os
 import posixpath
 import re
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path, PurePath
-from typing import Any
-
-import yaml
+from xml.sax.saxutils import unescape
 
 from drakegrasp.config import CarriedHand, Config, HandSource
 from drakegrasp.errors import DataError, HandError
+from drakegrasp.foreign_files import parse_json
 from drakegrasp.hand.file_format import hand_keys
-from drakegrasp.hand.files import (
-    MODEL_SUFFIXES,
-    PACKAGE,
-    file_of,
-    find_packages,
-    hand_file,
-    mesh_references,
-    refuse_outside,
-    rewritten,
-)
+from drakegrasp.hand.files import REFERENCES, hand_file, refuse_outside
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
-from drakegrasp.yaml_text import parse_yaml
 
 #: Maximum total size [byte], YAML size [byte] and number of a hand's files; a stranger may have
 #: written them.
 LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
+#: Number of hands whose files a process remembers.
+KEPT = 32
 #: Names of licence files next to a hand file or its model.
 _LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
-#: The keys of a hand file that name other files.
-_MODEL_LINE = re.compile(r"^model:.*$", re.MULTILINE)
-_PACKAGES_LINES = re.compile(r"^packages:.*\n(?:[ \t]+\S.*\n)*", re.MULTILINE)
+#: Suffixes of models and of files that a model may include.
+_MODELS = (".sdf", ".urdf", ".xml")
+#: References in Wavefront files: materials, and their textures at the end of a line.
+_MATERIALS = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE)
+_TEXTURES = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|norm)[ \t](?:.*[ \t])?(\S+)[ \t\r]*$", re.M)
 
 
 def hand_digest(source: HandSource) -> str:
@@ -62,89 +55,107 @@ def hand_digest(source: HandSource) -> str:
     return hand_folder(source).digest
 
 
-def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
-    """Return the content of a folder with all files of a hand.
-
-    Args:
-        source: The hand.
-        name: Name of the hand file in the folder; None keeps its name.
+def hand_folder(source: HandSource) -> HandFolder:
+    """Return the files of a hand; they are read again if one of them has changed.
 
     Raises:
-        HandError: If there is no such hand, its files are too large, or a dataset's hand names
-            files outside its folder.
+        HandError: If there is no such hand, its files are too large, or it names a file outside its
+            folder.
     """
-    # The hand file; a model outside its folder is copied into this folder.
     path = hand_file(source)
-    found = HandFolder(within=path.parent if isinstance(source, CarriedHand) else None)
-    found.has(path)
-    name, described = name or path.name, _described(path)
-    packages = found.packages_of(path, described)
-    model = str(described.get("model", ""))
-    place = found.place_of(model, "") or Path(model).name
-    moved = place != posixpath.normpath(model)
-    found.texts[name] = _with_model(path, place) if moved or packages else path.read_bytes()
+    key = path.absolute(), isinstance(source, CarriedHand)
+    known = _known.pop(key, None)
+    if known is None or known.stamp != file_stamp(known.asked):
+        known = _read_folder(*key)
+    while len(_known) >= KEPT:
+        _known.pop(next(iter(_known)))
+    _known[key] = known
+    return known
 
-    # The model, and licences.
-    if found.has(path.parent / model):
-        found.add_model(place, path.parent / model, packages, found.uris)
-    folders = dict.fromkeys([path.parent, (path.parent / model).parent, *packages.values()])
-    found.licences = found.add_licences(list(folders), path.stem.removesuffix("_hand"))
-    uris = (found.uris[uri] for uri in sorted(found.uris))
-    found.counted = (name, place, *uris, *found.parts.values())
+
+def _read_folder(path: Path, is_carried: bool) -> HandFolder:
+    """Return the files of the hand of a hand file."""
+    found = HandFolder(root=path.parent, name=path.name, is_carried=is_carried)
+    found.add(path.name)
+    model, named = found.place_of(_model_of(path), ""), dict[str, str]()
+    found.add(model, named)
+    found.add_licences(path.stem.removesuffix("_hand"), model)
+    geometry = (named[reference] for reference in sorted(named))
+    found.counted = (path.name, model, *geometry, *found.parts)
+    found.stamp = file_stamp(found.asked)
     return found
 
 
+def _model_of(path: Path) -> str:
+    """Return the model that a hand file names; empty if the file is not a YAML mapping."""
+    try:
+        tree = hand_keys(path)
+    except HandError:
+        return ""
+    return str(tree.get("model", "")) if isinstance(tree, dict) else ""
+
+
+def file_stamp(files: Collection[Path]) -> tuple[int, ...]:
+    """Return sizes [byte] and modification times [ns] of the files that exist."""
+    stats = [path.stat() for path in files if path.exists()]
+    return tuple(number for s in stats for number in (s.st_size, s.st_mtime_ns))
+
+
+# Not frozen: a cached hash and files that are collected one by one.
 @dataclass(kw_only=True)
 class HandFolder:
-    """The content of a folder with the files of a hand. A place is a path in the folder.
+    """The files of a hand. A place is a path in its folder.
 
     Attributes:
-        within: Folder that no file may leave, for a dataset's hand; None for another hand.
-        texts: Bytes of hand file and models, keyed by place.
-        files: Current paths of all other files, keyed by place.
+        root: The folder.
+        name: Name of the hand file.
+        is_carried: Whether it is the hand of a dataset, which a stranger may have written.
+        files: Paths of the files that exist, by place, the hand file first.
         counted: Places of the files in the digest, in their order; some of the files may be
             missing.
         licences: Places of the licences.
-        uris: Places of the geometry that the model names, by the references in the rewritten model.
-        parts: Places of the geometry that other files name; each key is its value.
-        sources: Whether each requested file exists.
+        parts: Places of the geometry that files other than the model name.
+        asked: Paths of the named files, whether they exist or not.
+        stamp: Sizes and times of these files.
         size: Total size of the files [byte].
     """
 
-    within: Path | None
-    texts: dict[str, bytes] = field(default_factory=dict)
+    root: Path
+    name: str
+    is_carried: bool
     files: dict[str, Path] = field(default_factory=dict)
     counted: tuple[str, ...] = ()
-    licences: tuple[str, ...] = ()
-    uris: dict[str, str] = field(default_factory=dict)
+    licences: list[str] = field(default_factory=list)
     parts: dict[str, str] = field(default_factory=dict)
-    sources: dict[Path, bool] = field(default_factory=dict)
+    asked: dict[Path, bool] = field(default_factory=dict)
+    stamp: tuple[int, ...] = ()
     size: int = 0
 
     def content(self, place: str) -> bytes:
         """Return the bytes of a file; empty if it does not exist."""
-        if place in self.texts:
-            return self.texts[place]
         return self.files[place].read_bytes() if place in self.files else b""
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """A hash (16 hex digits) of hand file, model and meshes, independent of paths."""
-        return _digest(map(self.content, self.counted))
+        digest = hashlib.sha256()
+        for place in self.counted:
+            digest.update(self.content(place))
+        return digest.hexdigest()[:16]
 
-    def place_of(self, reference: str, base: str) -> str | None:
-        """Return the place of a file that a file in the folder `base` names; None if outside.
+    def place_of(self, reference: str, base: str) -> str:
+        """Return the place of a file that a file in the folder `base` names.
 
         Raises:
-            HandError: If it is outside, and the hand is a dataset's.
+            HandError: If it is outside of the folder.
         """
         place = posixpath.normpath(posixpath.join(base, reference))
-        is_relative = "://" not in reference and not reference.startswith("/")
-        if is_relative and place.split("/")[0] != "..":
-            return place
-        if self.within is not None:
-            raise HandError(f"{self.within}: must name files in it only, got {reference!r}")
-        return None
+        if "://" in reference or reference.startswith("/") or place.split("/")[0] == "..":
+            raise HandError(
+                f"{self.root}: must name files in it only, got {reference!r}: copy the files into "
+                "the folder of the hand file, as `drakegrasp hand new` does"
+            )
+        return place
 
     def has(self, path: Path) -> bool:
         """Record a file, and return whether it exists.
@@ -154,14 +165,14 @@ class HandFolder:
                 or makes the files too large.
         """
         # Count a file once; a file of a dataset's hand must be in its folder.
-        if path in self.sources:
-            return self.sources[path]
+        if path in self.asked:
+            return self.asked[path]
         if "\0" in str(path):
             return False
-        if self.within is not None and os.path.lexists(path):
-            refuse_outside(path, self.within)
-        self.sources[path] = path.is_file()
-        if not self.sources[path]:
+        if self.is_carried and os.path.lexists(path):
+            refuse_outside(path, self.root)
+        self.asked[path] = path.is_file()
+        if not self.asked[path]:
             if path.exists() and not path.is_dir():  # Drake would read it without end
                 raise HandError(f"{path}: must be a file, got a pipe, a socket or a device")
             return False
@@ -170,132 +181,69 @@ class HandFolder:
         size = path.stat().st_size
         self.size += size
         long = path.suffix.lower() in (".yaml", ".yml") and size > LARGEST_YAML
-        if self.size > LARGEST or long or len(self.sources) > MOST_FILES:
+        if self.size > LARGEST or long or len(self.asked) > MOST_FILES:
             raise HandError(
                 f"{path}: the files of a hand must be at most {MOST_FILES} and {LARGEST >> 20} MB "
                 f"in all, its YAML {LARGEST_YAML >> 10} kB, got more"
             )
         return True
 
-    def packages_of(self, path: Path, described: Mapping[str, Any]) -> dict[str, Path]:
-        """Return the folders of the packages that a hand file or its model names.
-
-        Raises:
-            HandError: If the hand file of a dataset names packages.
-        """
-        if self.within is None:
-            return _packages(path)
-        if described.get("packages"):
-            raise HandError(f"{path}: must name files in its folder only, got packages")
-        return {}
-
-    def add(self, place: str, path: Path) -> None:
-        """Add a file and the files that it names, unless it is missing or already added."""
-        if place in self.files or place in self.texts or not self.has(path):
-            return
-        if path.suffix.lower() in MODEL_SUFFIXES:
-            self.add_model(place, path, {}, self.parts)
-            return
-        self.files[place] = path
-        for reference, is_geometry in mesh_references(path):
-            inner = self.place_of(reference, posixpath.dirname(place))
-            if inner is None:
-                continue  # the mesh is drawn without it
-            if is_geometry:
-                self.parts[inner] = inner
-            self.add(inner, path.parent / reference)
-
-    def add_model(
-        self, place: str, path: Path, packages: Mapping[str, Path], counted: dict[str, str]
-    ) -> None:
-        """Add an existing model and the files that it names; rewrite references to outside files.
+    def add(self, place: str, named: dict[str, str] | None = None) -> None:
+        """Add a file and the files that it names, unless it is missing or already added.
 
         Args:
-            place: Place of the model.
-            path: Present path of the model.
-            packages: Folders of `package://` URIs by package name.
-            counted: Receives the places of geometry by their references.
+            place: Place of the file.
+            named: Receives the places of geometry by the references to it; `parts` if None.
         """
-        base = posixpath.dirname(place)
+        path = self.root / place
+        if place in self.files or not self.has(path):
+            return
+        self.files[place] = path
+        for reference, is_geometry in _references(path):
+            inner = self.place_of(reference, posixpath.dirname(place))
+            if is_geometry and named is not None:
+                named[reference] = inner
+            elif is_geometry:
+                self.parts[inner] = inner
+            self.add(inner)
 
-        def add_named(uri: str, is_geometry: bool) -> str:
-            named, inner = file_of(uri, path.parent, packages), self.place_of(uri, base)
-            if inner is None:
-                inner = _elsewhere(named, self.has(named))
-                uri = posixpath.relpath(inner, base or ".")
-            if is_geometry:
-                counted[uri] = inner
-            self.add(inner, named)
-            return uri
-
-        self.texts[place] = b""  # for a model that includes itself
-        self.texts[place] = rewritten(path.read_bytes(), add_named)
-
-    def add_licences(self, folders: list[Path], hand: str) -> tuple[str, ...]:
-        """Add the licences in some folders; return their places."""
-        places = list[str]()
-        for folder in folders:
+    def add_licences(self, hand: str, model: str) -> None:
+        """Add the licences beside the hand file and the model."""
+        for base in dict.fromkeys(("", posixpath.dirname(model))):
+            folder = self.root / base
             for path in sorted(folder.iterdir()) if folder.is_dir() else ():
                 # In a folder with several hands, the name of a licence may begin with the hand's
                 # name.
                 name = path.name.removeprefix(f"{hand}_")
-                if _LICENCE.fullmatch(name):
-                    place = name if name not in self.files else f"{name}-{len(places)}"
-                    self.add(place, path)
-                    places += [place] if place in self.files else []
-        return tuple(places)
+                if _LICENCE.fullmatch(name) and self.has(path):
+                    place = name if name not in self.files else f"{name}-{len(self.licences)}"
+                    self.files[place] = path
+                    self.licences.append(place)
 
 
-def _elsewhere(path: Path, there: bool) -> str:
-    """Return the place of a file that is not below the hand file."""
-    if not there:
-        return f"absent/{path.name}"
-    return f"files/{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}/{path.name}"
+def _references(path: Path) -> Iterator[tuple[str, bool]]:
+    """Yield each file that a model, a mesh or a material names, and whether it is geometry."""
+    suffix = path.suffix.lower()
+    if suffix in _MODELS:
+        for match in REFERENCES.finditer(path.read_bytes()):
+            kind = str(match.lastgroup)
+            reference = unescape(match[kind].decode(errors="surrogateescape"))
+            yield reference, kind in ("uri", "mesh")
+    elif suffix in (".obj", ".mtl"):
+        for name in (_MATERIALS if suffix == ".obj" else _TEXTURES).findall(path.read_bytes()):
+            yield name.decode(errors="surrogateescape"), False
+    elif suffix == ".gltf":
+        try:
+            tree = parse_json(path.read_bytes())
+            parts = [(part["uri"], key == "buffers") for key in ("buffers", "images")
+                     for part in tree.get(key, ()) if "uri" in part]  # fmt: skip
+        except (ValueError, TypeError, AttributeError):
+            return  # Drake rejects it
+        yield from ((str(uri), counts) for uri, counts in parts if not str(uri).startswith("data:"))
 
 
-def _described(path: Path) -> Mapping[str, Any]:
-    """Return the keys of a hand file; empty if the file is not a YAML mapping."""
-    try:
-        tree = hand_keys(path)
-    except HandError:
-        return {}
-    return tree if isinstance(tree, dict) else {}
-
-
-def _packages(path: Path) -> dict[str, Path]:
-    """Return the folders of the packages that a hand file or its model names."""
-    described = _described(path)
-    named, model = described.get("packages"), path.parent / str(described.get("model", ""))
-    own = named.items() if isinstance(named, dict) else ()
-    folders = {str(k): path.parent / str(v) for k, v in own}
-    if model.is_file() and PACKAGE.encode() in model.read_bytes():
-        return find_packages(path.parent, str(described.get("model")), {}) | folders
-    return folders
-
-
-def _with_model(path: Path, place: str) -> bytes:
-    """Return the text of a hand file with the model at another place and without packages."""
-    keys = {**_described(path), "model": place}
-    keys.pop("packages", None)
-
-    # Keep comments, unless the keys are written in an unusual way.
-    try:
-        text = path.read_text(encoding="utf-8")
-        text = _MODEL_LINE.sub(lambda match: yaml.safe_dump({"model": place}).strip(), text)
-        text = _PACKAGES_LINES.sub("", text)
-        same = parse_yaml(text) == keys
-    except (yaml.YAMLError, UnicodeDecodeError):
-        same = False
-    return text.encode() if same else yaml.safe_dump(keys, sort_keys=False).encode()
-
-
-def _digest(contents: Iterable[bytes]) -> str:
-    """Return a hash (16 hex digits) of concatenated contents."""
-    digest = hashlib.sha256()
-    for content in contents:
-        digest.update(content)
-    return digest.hexdigest()[:16]
-
+#: The files of hands, by hand file and whether a dataset carries it; the last used come last.
+_known: dict[tuple[Path, bool], HandFolder] = {}
 
 #: Folder of the hand's files in a dataset's directory.
 HAND_FOLDER = "hand"
@@ -355,13 +303,13 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
     if PurePath(name).name != name or name.endswith(".yaml"):
         name = f"{HAND_FOLDER}/{_file_name(name)}"
     path = out.absolute() / HAND_FOLDER / _file_name(name)
-    content = hand_folder(config.hand_source, path.name)
+    content = hand_folder(config.hand_source)
     carried = CarriedHand(path=path, digest=content.digest)
     if known is None and not isinstance(config.hand_source, CarriedHand):
-        _refuse_other_files(content, path.parent)
+        _refuse_other_files(content, path)
     if not _is_there(carried):
         with disk_full_named(out):
-            _write(content, path.parent)
+            _write(content, path)
     return config.with_hand(name, carried)
 
 
@@ -378,17 +326,22 @@ def _is_there(carried: CarriedHand) -> bool:
         return False
 
 
-def _refuse_other_files(content: HandFolder, folder: Path) -> None:
+def _refuse_other_files(content: HandFolder, path: Path) -> None:
     """Reject a folder that contains user files, because a build replaces and removes its content.
+
+    Args:
+        content: The files of the hand.
+        path: Their hand file in the dataset's directory.
 
     Raises:
         DataError: If the folder exists and is not a copy of the hand from a build that was killed.
     """
+    folder = path.parent
     if not os.path.lexists(folder):
         return
     there = {path for path in folder.rglob("*") if not path.is_dir()}
-    copies = {folder / place: content.content(place) for place in (*content.texts, *content.files)}
-    is_source = any(path.resolve().is_relative_to(folder.resolve()) for path in content.sources)
+    copies = {to: content.content(place) for place, to in _copies(content, path).items()}
+    is_source = any(path.resolve().is_relative_to(folder.resolve()) for path in content.asked)
     if is_source or there != copies.keys() or any(p.read_bytes() != copies[p] for p in there):
         raise DataError(
             f"{folder}: must not be there before a build, which puts the hand's files there, "
@@ -396,12 +349,17 @@ def _refuse_other_files(content: HandFolder, folder: Path) -> None:
         )
 
 
-def _write(content: HandFolder, folder: Path) -> None:
+def _copies(content: HandFolder, path: Path) -> dict[str, Path]:
+    """Return the path of each file's copy, by its place, if that of the hand file is `path`."""
+    return {place: path.parent / place for place in content.files} | {content.name: path}
+
+
+def _write(content: HandFolder, path: Path) -> None:
     """Write the files of a hand, and remove files of another hand that a build left there."""
+    folder = path.parent
     shutil.rmtree(folder, ignore_errors=True)
     with atomic_folder(folder) as temporary:
-        for place in (*content.texts, *content.files):
-            path = temporary / place
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content.content(place))
-            sync(path)
+        for place, copy in _copies(content, temporary / path.name).items():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(content.content(place))
+            sync(copy)

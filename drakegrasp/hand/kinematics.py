@@ -9,23 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.distance import cdist
 
 from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.frames import rotation_about, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import Drive, with_efforts
 from drakegrasp.hand.parsing import Chain
-from drakegrasp.hand.shapes import link_shapes, pad_surfaces
-
-#: Positions of each coordinate at which the opening of a hand is measured.
-OPENING_STEPS = 9
-#: Positions of each finger at which the reach of a hand is measured.
-REACH_STEPS = 41
 
 
 def coordinate_limits(hand: Hand) -> Array:
@@ -141,70 +133,6 @@ def posed_links(hand: Hand, positions: Mapping[str, Array]) -> dict[str, Array]:
     return {
         link: multiply(posed[chain.joints], chain.X_JFi) for link, chain in hand.link_chains.items()
     }
-
-
-def opening(hand: Hand) -> float:
-    """Return the largest distance [m] between the pads of two fingers, over spread and closing.
-
-    Each coordinate takes `OPENING_STEPS` positions from limit to limit.
-
-    Raises:
-        HandError: See `hand.shapes.link_shapes`.
-    """
-    low, high = coordinate_limits(hand).T
-    corners = [
-        np.unique(pad.reshape(-1, 3), axis=0) for pad in pad_surfaces(hand.model, hand.fingers)
-    ]
-    share = np.linspace(0.0, 1.0, OPENING_STEPS)
-    closing, largest = low[1:] + share[:, None] * (high - low)[1:], 0.0
-    for spread in low[0] + share * (high - low)[0]:
-        X_GF = fingertip_poses(hand, spread=np.full(len(share), spread), closing=closing)
-        points = [
-            np.concatenate([transform_points(X, pad) for X in X_GF[:, i]])
-            for i, pad in enumerate(corners)
-        ]
-        for p, q in combinations([p for p in points if len(p)], 2):
-            largest = max(largest, float(cdist(p, q).max()))
-    return largest
-
-
-def flat_limits(hand: Hand) -> tuple[float, float]:
-    """Return the height [m] that objects up to a width [m] need, if the hand faces the table.
-
-    While the fingers close, the fingertips move ahead of the palm, by the reach of the hand. At a
-    stand-off below this reach, the fingertips arrive below the top of the object by the difference;
-    an object of that height keeps them above the table. At a larger stand-off they close above the
-    object. An object that is wider than the width [m] is touched before the fingertips get there.
-
-    Raises:
-        HandError: See `hand.shapes.link_shapes`.
-    """
-    ahead, spread, closing = _reach(hand)
-    height = min((ahead - s for s in hand.standoffs if s < ahead), default=0.0)
-    tips = fingertip_poses(hand, spread=spread, closing=closing)
-    pads = [pad.reshape(-1, 3) for pad in pad_surfaces(hand.model, hand.fingers)]
-    points = [transform_points(X, pad) for X, pad in zip(tips, pads, strict=True) if len(pad)]
-    return height, max((float(cdist(p, q).min()) for p, q in combinations(points, 2)), default=0.0)
-
-
-def _reach(hand: Hand) -> tuple[float, float, Array]:
-    """Return how far ahead of the palm a hand reaches while it closes, and in which posture.
-
-    At both limits of the spread, all fingers close together in `REACH_STEPS` steps.
-
-    Returns:
-        The distance along +Gz [m], the spread [rad] and the closing positions (k,) [rad or m].
-    """
-    closing = np.linspace(0.0, closed_positions(hand), REACH_STEPS)
-    corners = {link: parts for link, parts in link_shapes(hand.model).items() if parts}
-    farthest, at = 0.0, (0.0, closing[0])
-    for spread in coordinate_limits(hand)[0].tolist():
-        for link in corners.keys() & hand.link_chains.keys():
-            X_GL = link_poses(hand, link, spread=spread, closing=closing)
-            ahead = (X_GL[:, 2, :3] @ np.concatenate(corners[link]).T + X_GL[:, 2, 3:]).max(axis=1)
-            if ahead.max() > farthest:
-                farthest, at = float(ahead.max()), (spread, closing[ahead.argmax()])
-    return farthest, *at
 
 
 def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:

@@ -65,12 +65,10 @@ class ModelFile:
 
     Attributes:
         path: The SDFormat or URDF file.
-        packages: Name and folder of each package of a package:// URI.
         stamp: Sizes and times of the hand's files; a model with changed files is not equal.
     """
 
     path: Path
-    packages: tuple[tuple[str, Path], ...] = ()
     stamp: tuple[int, ...] = ()
 
 
@@ -96,12 +94,9 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     Raises:
         HandError: If the file cannot be read, for example because a mesh is missing.
     """
-    # Read the file; package:// URIs are resolved in the known packages.
     if not model.path.is_file():
         raise HandError(f"model: must be an SDFormat or URDF file, got {str(model.path)!r}")
     parser = make_parser(plant)
-    for name, folder in model.packages:
-        parser.package_map().Add(name, str(folder))
     actuators = set(plant.GetJointActuatorIndices())
     constraints = set(plant.GetConstraintIds())
     try:

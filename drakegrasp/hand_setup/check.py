@@ -35,7 +35,7 @@ from drakegrasp.hand.finger_sweep import Pinch, find_opposition, find_pinch, rea
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel, make_object
-from drakegrasp.outcomes import LOST, Outcome
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
@@ -75,18 +75,6 @@ _SOFT = (
     "two motors that push against each other do not hold along their line; say `drive: worm` if "
     "its gears cannot be pushed open, or its fingers share a motor"
 )
-#: How to repair a hand that loses the object, and hands with other failures, by their labels.
-_LOST = "pads must face each other where they meet, and motors press enough (efforts)"
-_MENDS = {
-    Outcome.MISSING_FINGERTIP.label: "fingertips must touch it within the pad_region; let the "
-    "region reach 3 mm behind its face and to the end of the finger",
-    Outcome.HAND_CONTACT.label: "other links touch it first; open the hand wider, or move the palm "
-    "back (p_BG)",
-    Outcome.START_COLLISION.label: "the open hand is in its way; keep fingers that do not grasp "
-    "away with preshape",
-    **{o.label: _LOST for o in LOST},
-    MOVED: _LOST,
-}
 
 
 def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> Finding:
@@ -131,9 +119,7 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
         return judge(name, [] if ok else [f"{text}: {_SOFT}"], text)
 
     tried = ", ".join(f"{count} {label}" for label, count in outcomes.items())
-    text = f"a {shape} must be held, got {tried or 'no posture that holds one'}"
-    mend = _MENDS.get(outcomes.most_common(1)[0][0]) if outcomes else None
-    return judge(name, [f"{text}: {mend}" if mend else text], "")
+    return judge(name, [f"a {shape} must be held, got {tried or 'no posture that holds one'}"], "")
 
 
 def _stands_wide(hand: Hand) -> bool:

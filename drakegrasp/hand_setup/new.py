@@ -10,11 +10,12 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
@@ -24,17 +25,17 @@ from drakegrasp.hand.checks import (
     check_efforts,
     check_geometry,
     check_limits,
+    early_overlaps,
     judge,
+    overlap_query,
 )
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.fingers import Answers, find_fingers, find_palm
-from drakegrasp.hand.draft.grips import find_grips, is_clear, trace_finger
-from drakegrasp.hand.draft.hand_file import Draft, draft_file, positions, unused_fingers
+from drakegrasp.hand.draft.grips import Grip, find_grips, trace_finger
+from drakegrasp.hand.draft.hand_file import Draft, draft_file, positions
 from drakegrasp.hand.draft.palm import find_palm_frames
 from drakegrasp.hand.draft.source import read_model
-from drakegrasp.hand.draft.urdf import write_urdf
-from drakegrasp.hand.draft.vendor import VendorModel, doubtful_units
-from drakegrasp.hand.overlaps import overlap_query
+from drakegrasp.hand.draft.vendor import VendorModel, write_urdf
 from drakegrasp.hand.parsing import ModelFile
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand_setup.check import GRASPS, check_grasp
@@ -46,12 +47,12 @@ from drakegrasp.runtime.files import atomic_folder
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Number of postures in which links of different fingers are compared.
 POSTURES = 24
+#: Allowed overlap of links other than fingertips [m].
+SUNK = 5e-4
 #: Largest cost of a grip [rad]: it lacks one thing of a usual pinch, and its angles are below 90°.
 WORST = 1.5 * np.pi
-#: Patterns of a vendor's licence files.
+#: Patterns of licence files beside a model.
 LICENCES = ("LICENSE*", "LICENCE*", "COPYING*", "NOTICE*")
-#: Number of folders above the model's that may have licence files.
-MOST_ABOVE = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +61,7 @@ class NewHand:
 
     Attributes:
         path: The hand file.
-        notes: What was left out of the model, added to it, or is not used.
+        notes: What was left out of the model or added to it.
         findings: Findings of the checks of its files and geometry.
     """
 
@@ -95,37 +96,14 @@ def draft_hand(
     model = read_model(path, packages)
     answers.refuse_unknown(model)
 
-    doubts = tuple(doubtful_units(model))
-    try:
-        best, findings = _find_best(model, path, answers, config)
-    except HandError as error:
-        raise HandError("; ".join((str(error), *doubts))) from None
+    best, findings = _find_best(model, path, answers, config)
     if out.exists():
         out.rmdir()
     with atomic_folder(out) as folder:
         written = _write(best, folder, path)
-        licences = _licences(path.resolve().parent)
-        for licence in licences:
+        for licence in chain.from_iterable(path.resolve().parent.glob(name) for name in LICENCES):
             shutil.copyfile(licence, folder / licence.name)
-    far = sorted({str(each) for each in licences if each.parent != path.resolve().parent})
-    notes = [f"{each} is copied: check that it is the licence of the model" for each in far]
-    notes = [*doubts, *model.notes, *unused_fingers(model, best.grip, answers), *notes]
-    return NewHand(path=out / written.name, notes=tuple(notes), findings=findings)
-
-
-def _licences(folder: Path) -> list[Path]:
-    """Return the licence files of the closest folder with some, from the model's folder upwards.
-
-    A repository often has one at its root. A file above the root, or far above, is another
-    project's.
-    """
-    for above in (folder, *folder.parents[:MOST_ABOVE]):
-        found = chain.from_iterable(above.glob(name) for name in LICENCES)
-        if files := sorted({file for file in found if file.is_file()}):
-            return files
-        if (above / ".git").exists() or above == Path.home():
-            break
-    return []
+    return NewHand(path=out / written.name, notes=model.notes, findings=findings)
 
 
 def _find_best(
@@ -141,7 +119,7 @@ def _find_best(
         for g, drafts in enumerate(_drafts(model, answers, config, Path(scratch))):
             # Try the palm frames of a grip until its geometry is sound, then whether it holds.
             for f, draft in enumerate(drafts):
-                file = _write(draft, Path(scratch) / f"{g}_{f}", path, drawn=False)
+                file = _write(draft, Path(scratch) / f"{g}_{f}", path)
                 findings = _findings(file, config)
                 sound = all(finding.ok for finding in findings)
                 for shape, line in GRASPS if sound else ():
@@ -157,8 +135,8 @@ def _find_best(
                 break
     if best is None:
         raise HandError(
-            "model: no direction in which the palm faces the pinch is free: say it with --approach "
-            "X,Y,Z in the palm link, or which fingers grasp with --fingers LINK,LINK"
+            "model: no direction in which the palm faces the pinch is free: say which "
+            "fingers grasp with --fingers LINK,LINK"
         )
     return best[1:]
 
@@ -174,43 +152,41 @@ def _drafts(
         tips = ", ".join(joints[-1].child for joints, _ in fingers)
         raise HandError(
             f"model: no fingers of {tips} close against each other: give positions of joints that "
-            "do not close with --joint NAME=POSITION, or what closes the other way with --reverse "
-            "JOINT"
+            "do not close with --joint NAME=POSITION"
         )
 
     # Leave out grips whose links collide too early; if all do, the first of all is used.
-    write_urdf(_undrawn(model), scratch / "vendor.urdf", [])
-    overlaps, shares = (
-        overlap_query(ModelFile(scratch / "vendor.urdf"), palm),
-        np.linspace(0.0, 1.0, POSTURES),
-    )
-    clear = (g for g in grips if is_clear(g, (positions(model, g, s) for s in shares), overlaps))
-    for grip in chain(islice(clear, GRIPS), grips[:1]):
+    write_urdf(model, scratch / "vendor.urdf", [])
+    query = overlap_query(ModelFile(scratch / "vendor.urdf"), palm)
+
+    def is_clear(grip: Grip) -> bool:
+        movers = {joint.child: i for i, f in enumerate(grip.fingers) for joint in f.joints}
+        postures = (positions(model, grip, share) for share in np.linspace(0.0, 1.0, POSTURES))
+        tips = {finger.tip for finger in grip.fingers}
+        return max(early_overlaps(query, postures, movers, tips).values(), default=0.0) <= SUNK
+
+    for grip in chain(islice(filter(is_clear, grips), GRIPS), grips[:1]):
         postures = [positions(model, grip, share) for share in SHARES]
-        frames = find_palm_frames(model, palm, grip, postures, answers.approach)
+        frames = find_palm_frames(model, palm, grip, postures)
         yield (draft_file(model, palm, grip, frame, answers, config) for frame in frames[:FRAMES])
 
 
-def _undrawn(model: VendorModel) -> VendorModel:
-    """Return a model without its visual shapes, which take most of the time of writing."""
-    links = {name: replace(link, visuals=()) for name, link in model.links.items()}
-    return replace(model, links=links)
-
-
-def _write(draft: Draft, folder: Path, path: Path, *, drawn: bool = True) -> Path:
+def _write(draft: Draft, folder: Path, path: Path) -> Path:
     """Write the files of a hand, and return the hand file."""
     folder.mkdir(exist_ok=True)
     stem = path.stem if path.stem.endswith("_hand") else f"{path.stem}_hand"
     model, file = folder / f"{stem}.urdf", folder / f"{stem}.yaml"
     head = [f"Made from {path.name} by `drakegrasp hand new`.", *draft.changed, *draft.model.notes]
-    write_urdf(draft.model if drawn else _undrawn(draft.model), model, head)
+    write_urdf(draft.model, model, head)
     lines = [
-        f"Drafted from {path.name} by `drakegrasp hand new`. A comment is why a value was guessed:",
-        "look at the picture, correct them, and run `drakegrasp hand check` again.",
+        f"Drafted from {path.name} by `drakegrasp hand new`. Values are guesses: look at the",
+        "picture, correct them, and run `drakegrasp hand check` again.",
         "Units: m, rad, N, N m, kg; degrees in keys that end in _deg.",
     ]
-    named = replace(draft, tree={**draft.tree, "model": model.name})
-    file.write_text(named.text(lines), encoding="utf-8")
+    text = yaml.safe_dump(
+        {**draft.tree, "model": model.name}, sort_keys=False, default_flow_style=None, width=100
+    )
+    file.write_text("".join(f"# {line}\n" for line in lines) + text, encoding="utf-8")
     return file
 
 

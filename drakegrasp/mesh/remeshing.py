@@ -1,9 +1,8 @@
 """Remeshing: a surface comes in; about the same surface, with other triangles, goes out.
 
-`decimate` reduces a solid to what Drake simulates. `coarsen` is applied before a file is repaired:
-repair takes kilobytes for each face, and a scan may have millions of faces, far finer than what a
-fingertip feels or a camera sees. It first merges near vertices, since quadric decimation itself
-takes much memory, and then decimates; a surface of at most `MOST_FACES` faces is not changed.
+`decimate` reduces a solid to what Drake simulates. `coarsen` is applied before a file is repaired,
+which takes kilobytes for each face: a scan may have far more faces than a fingertip feels or a
+camera sees.
 
 The other functions prepare surfaces that support an object. Each face of a rigid hydroelastic
 surface yields one contact polygon, and each polygon has one point of force: a base of two triangles
@@ -24,14 +23,13 @@ import trimesh
 from drakegrasp.arithmetic import dot
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mesh.components import edge_ids, find_components, part_touching_edges
+from drakegrasp.mesh.components import edge_ids, find_components
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     MAX_OVERLAP,
     Faces,
     Solid,
     compact,
-    connect,
     diagonal,
     even_points,
     face_areas,
@@ -46,17 +44,11 @@ from drakegrasp.mesh.surfaces import (
     to_manifold,
     unit_normals,
 )
-from drakegrasp.runtime.environment import release_memory
 
 #: Aggressiveness of the quadric decimation, best quality first.
 DECIMATION_STEPS = (2.0, 3.0, 5.0, 7.0)
 #: Deviation, as a fraction of the diagonal, above which the second method is tried.
 FAITHFUL = 2e-3
-#: Deviation [m] above which the methods for scans are tried as well.
-COARSE = 2e-3
-#: Target of the methods for scans, as a fraction of the allowed faces, since parting adds some; and
-#: the larger target of a first decimation, after which fewer spikes of noise are left.
-PARTED, FIRST = 0.97, 5.0 / 3.0
 #: Fraction of its volume that a decimated mesh may gain or lose.
 MAX_VOLUME_CHANGE = 0.05
 #: Number of points on each surface at which the deviation of two surfaces is measured.
@@ -68,9 +60,7 @@ def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
 
     Quadric decimation (Garland and Heckbert 1997) keeps the shape better, but does not guarantee a
     closed surface; manifold3d's simplification does. The latter is tried if the former fails or
-    deviates by more than `FAITHFUL`. If both fail or deviate by more than `COARSE`, as for noisy
-    thin walls, quadric decimation is tried again, with its surface parted where it then touches
-    itself. The closest result is returned.
+    deviates by more than `FAITHFUL`. The closest result is returned.
 
     Raises:
         MeshError: If no method yields a closed surface of about the same volume.
@@ -79,20 +69,14 @@ def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
         return solid, 0.0
 
     # Keep the closest valid result; the first that is close enough ends the search.
-    faithful = FAITHFUL * diagonal(solid.vertices)
     best: tuple[Solid, float] | None = None
-    for candidate, enough in (
-        (_decimate_quadric, faithful),
-        (_simplify_manifold, max(faithful, COARSE)),
-        (_decimate_parted, max(faithful, COARSE)),
-        (_decimate_twice, 0.0),
-    ):
+    for candidate in (_decimate_quadric, _simplify_manifold):
         reduced = candidate(solid, max_faces)
         if reduced is not None and _is_sound(reduced, solid):
             error = surface_deviation(solid, reduced)
             if best is None or error < best[1]:
                 best = reduced, error
-        if best is not None and best[1] <= enough:
+        if best is not None and best[1] <= FAITHFUL * diagonal(solid.vertices):
             break
 
     if best is None:
@@ -143,40 +127,14 @@ def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
     return None
 
 
-def _decimate_parted(solid: Solid, max_faces: int) -> Solid | None:
-    """Return the least aggressive decimation, parted where its surface touches itself, or None."""
-    target = int(PARTED * max_faces)
-    if len(solid.faces) <= target:
-        return solid  # fast_simplification rejects a target above the number of faces
-    for aggressiveness in DECIMATION_STEPS:
-        reduced = reduce_and_part(solid, target, aggressiveness)
-        if 0 < len(reduced.faces) <= max_faces:
-            return reduced
-    return None
-
-
-def _decimate_twice(solid: Solid, max_faces: int) -> Solid | None:
-    """Return `_decimate_parted` of a surface that was first reduced to somewhat more faces."""
-    between = int(FIRST * max_faces)
-    if len(solid.faces) <= between:
-        return None  # fast_simplification rejects a target above the number of faces
-    return _decimate_parted(reduce_and_part(solid, between, DECIMATION_STEPS[0]), max_faces)
-
-
-def reduce_and_part(solid: Solid, target: int, aggressiveness: float) -> Solid:
-    """Return a quadric decimation without duplicate faces and touching edges.
+def _simplify(solid: Solid, target: int, aggressiveness: float) -> tuple[Array, Faces]:
+    """Return vertices and faces of a quadric decimation.
 
     Args:
         solid: The surface, which has more faces than `target`.
         target: Desired number of faces.
         aggressiveness: How fast the error may grow from round to round, see `DECIMATION_STEPS`.
     """
-    vertices, faces = part_touching_edges(*weld(*_simplify(solid, target, aggressiveness)))
-    return Solid(vertices=vertices, faces=faces)
-
-
-def _simplify(solid: Solid, target: int, aggressiveness: float) -> tuple[Array, Faces]:
-    """Return vertices and faces of a quadric decimation, see `reduce_and_part`."""
     vertices, faces = fast_simplification.simplify(
         np.ascontiguousarray(solid.vertices),
         np.ascontiguousarray(solid.faces),
@@ -203,14 +161,9 @@ def _simplify_manifold(solid: Solid, max_faces: int) -> Solid | None:
 
 # Before repair
 
-#: Number of faces to which a surface with more is reduced: edges of 0.9 mm on a ball of 10 cm.
-MOST_FACES = 100_000
-#: Number of faces above which near vertices are first merged, to at most as many faces.
-MOST_DECIMATED = 300_000
-#: Edge of the cells in which vertices are merged: the first edge, as a fraction of the diagonal,
-#: and the factor from one try to the next. They are products, so that all machines have the same
-#: edges.
-FIRST_CELL, CELL_FACTOR = 1.0 / 8192.0, 1.25
+#: Number of faces to which a surface with more is reduced: edges of 0.9 mm on a ball of 10 cm; and
+#: the largest number, because decimation takes much memory as well.
+MOST_FACES, MOST_READ = 100_000, 1_000_000
 
 
 def coarsen(vertices: Array, faces: Faces) -> tuple[Array, Faces, tuple[str, ...]]:
@@ -221,83 +174,30 @@ def coarsen(vertices: Array, faces: Faces) -> tuple[Array, Faces, tuple[str, ...
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3), as `weld` returns them.
+
+    Raises:
+        MeshError: If it has more than `MOST_READ` faces.
     """
     if len(faces) <= MOST_FACES:
         return vertices, faces, ()
+    if len(faces) > MOST_READ:
+        raise MeshError(
+            f"a mesh must have at most {MOST_READ:,} faces, got {len(faces):,}: reduce it with "
+            "another program"
+        )
 
-    # The allocator still holds the memory that reading the file took.
-    release_memory()
-
-    # A surface too large for quadric decimation is clustered first.
+    # The least aggressive decimation with few enough faces.
     solid = Solid(vertices=vertices, faces=faces)
-    if len(faces) > MOST_DECIMATED:
-        solid = _cluster(vertices, faces)
+    for aggressiveness in DECIMATION_STEPS:
+        fewer, new = weld(*_simplify(solid, MOST_FACES, aggressiveness))
+        if 0 < len(new) <= 1.05 * MOST_FACES:
+            break
 
-    # The least aggressive decimation with few enough faces; parting adds some.
-    if len(solid.faces) > MOST_FACES:
-        full = solid
-        for aggressiveness in DECIMATION_STEPS:
-            solid = reduce_and_part(full, MOST_FACES, aggressiveness)
-            if 0 < len(solid.faces) <= 1.05 * MOST_FACES:
-                break
-
-    release_memory()
-    deviation = _deviation(vertices, solid)
-    note = (
-        f"its {len(faces):,} faces were reduced to {len(solid.faces):,}, within "
-        f"{deviation * 1e3:.2g} mm"
-    )
-    return solid.vertices, solid.faces, (note,)
-
-
-def _cluster(vertices: Array, faces: Faces) -> Solid:
-    """Return a surface with at most `MOST_DECIMATED` faces by merging near vertices.
-
-    After Rossignac and Borrel 1993, "Multi-resolution 3D approximations for rendering complex
-    scenes": vertices in the same cell of a grid are replaced by their mean. Here only vertices that
-    are joined by edges within the cell are merged, so that two nearby sheets of surface stay
-    separate.
-    """
-    low, cell = vertices.min(axis=0), FIRST_CELL * diagonal(vertices)
-    while True:
-        # A closed surface has half as many vertices as faces.
-        key = _cells(vertices - low, cell)
-        if len(np.unique(key)) <= MOST_DECIMATED // 2:
-            merged = weld(*_merge(vertices, faces, key))
-            if len(merged[1]) <= MOST_DECIMATED:
-                return Solid(vertices=merged[0], faces=merged[1])
-        cell *= CELL_FACTOR
-
-
-def _cells(points: Array, cell: float) -> Faces:
-    """Return the index of the cell of each point (n,) in a grid of cubes with edge `cell`."""
-    x, y, z = np.floor(points / cell).astype(np.int64).T
-    return np.asarray((x * (int(y.max()) + 1) + y) * (int(z.max()) + 1) + z)
-
-
-def _merge(vertices: Array, faces: Faces, key: Faces) -> tuple[Array, Faces]:
-    """Return a surface in which vertices joined by edges within a cell are merged at their mean."""
-    # The edges within cells, from each corner to the next.
-    pairs = []
-    for corner in range(3):
-        a, b = faces[:, corner], faces[:, (corner + 1) % 3]
-        within = key[a] == key[b]
-        pairs.append(np.stack((a[within], b[within])).astype(np.int32))
-    first, second = np.concatenate(pairs, axis=1)
-    count, cluster = connect(first, second, len(vertices))
-
-    sizes = np.bincount(cluster, minlength=count)
-    means = [np.bincount(cluster, vertices[:, axis], count) / sizes for axis in range(3)]
-    faces = cluster[faces].astype(np.int64)
-    return np.column_stack(means), faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-
-
-def _deviation(vertices: Array, solid: Solid) -> float:
-    """Return the largest distance [m] of some vertices of the full surface from the reduced one."""
     # In millimetres: trimesh (5) treats triangles with edges below a millimetre as degenerate.
-    surface = trimesh.Trimesh(1e3 * solid.vertices, solid.faces, process=False)
-    points = 1e3 * some_vertices(vertices)
-    return float(trimesh.proximity.closest_point(surface, points)[1].max()) / 1e3
+    surface = trimesh.Trimesh(1e3 * fewer, new, process=False)
+    deviation = trimesh.proximity.closest_point(surface, 1e3 * some_vertices(vertices))[1].max()
+    note = f"its {len(faces):,} faces were reduced to {len(new):,}, within {deviation:.2g} mm"
+    return fewer, new, (note,)
 
 
 # Surfaces that support

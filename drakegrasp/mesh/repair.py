@@ -26,7 +26,6 @@ from drakegrasp.mesh.components import (
     face_components,
     find_components,
     pair_half_edges,
-    part_touching_edges,
 )
 from drakegrasp.mesh.surfaces import (
     Faces,
@@ -45,10 +44,6 @@ from drakegrasp.mesh.union import separate, unite
 #: Vertices closer than this fraction of the diagonal are merged: above the rounding of files
 #: with eight digits, far below the detail of any scan.
 WELD = 1e-8
-#: Number of vertices that are sorted at a time while equal ones are merged.
-WELD_PART = 300_000
-#: Number of vertices below which three vertex indices fit into one 64-bit integer.
-MOST_PACKED = 2**21
 #: Maximum number of pieces of a surface: each takes milliseconds, and no object that a hand lifts
 #: has more.
 MOST_PIECES = 5_000
@@ -81,53 +76,22 @@ def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     low = vertices.min(axis=0, initial=np.inf, where=used[:, None])
     high = vertices.max(axis=0, initial=-np.inf, where=used[:, None])
     spacing = WELD * max(float(norm(high - low)), 1e-300)
-    faces = _first_equal(vertices, spacing)[faces]
+    _, first, inverse = np.unique(
+        np.round(vertices / spacing), axis=0, return_index=True, return_inverse=True
+    )
+    faces = first[inverse.reshape(-1)][faces].astype(np.int64)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
     # A face that occurs twice is a copy, or the wall between two touching solids. The
     # interpretation that leaves fewer edges with an odd number of faces is taken.
-    index, inverse, counts = _unique_faces(faces)
+    _, index, inverse, counts = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
     if (counts > 1).any():
         once = faces[np.sort(index)]
-        without = faces[counts[inverse] != 2]
+        without = faces[counts[inverse.reshape(-1)] != 2]
         faces = min((once, without), key=_odd_edges) if len(without) else once
     return compact(vertices, faces)
-
-
-def _first_equal(vertices: Array, spacing: float) -> Faces:
-    """Return for each vertex the first vertex (n,) that rounds to the same point of a grid.
-
-    Sorting all vertices at once would take several times their memory: an STL file has each vertex
-    six times. So each part of the vertices is sorted first, and then what remains of the parts.
-    """
-    firsts, indices, total = [], [], 0
-    for start in range(0, len(vertices), WELD_PART):
-        part = np.round(vertices[start : start + WELD_PART] / spacing)
-        _, first, inverse = np.unique(part, axis=0, return_index=True, return_inverse=True)
-        firsts.append(start + first)
-        indices.append((total + inverse.reshape(-1)).astype(np.int32))
-        total += len(first)
-    kept, index = np.concatenate(firsts), np.concatenate(indices)
-    if len(firsts) == 1:
-        return kept[index].astype(np.int64)
-
-    # If vertices of two parts are equal, the one of the earlier part is the first.
-    grid = np.round(vertices[kept] / spacing)
-    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    return kept[first[inverse.reshape(-1)]][index].astype(np.int64)
-
-
-def _unique_faces(faces: Faces) -> tuple[Faces, Faces, Faces]:
-    """Return the first face of each set of three vertices, and each face's set and its size."""
-    corners = np.sort(faces, axis=1)
-    base = int(corners.max(initial=0)) + 1
-    if base < MOST_PACKED:
-        # One number per face sorts like its three indices, and takes a third of the memory.
-        corners = (corners[:, 0] * base + corners[:, 1]) * base + corners[:, 2]
-    _, index, inverse, counts = np.unique(
-        corners, axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
-    return index, inverse.reshape(-1), counts
 
 
 def repair_solid(vertices: Array, faces: Faces) -> Solid:
@@ -140,23 +104,8 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
     Raises:
         MeshError: If the surface cannot become a solid without inventing shape.
     """
-    try:
-        return _repair(vertices, faces, [])
-    except MeshError as reason:
-        # Scans touch themselves along edges, where rims then cross: part these edges and try again.
-        touching = int((edge_ids(faces)[1] > 2).sum())
-        if not touching:
-            raise
-        note = f"the surface touched itself along {touching} edges and was parted there"
-        try:
-            return _repair(*part_touching_edges(vertices, faces), [note])
-        except MeshError:
-            raise reason from None
-
-
-def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
     # Make one surface, while neighbours are still known.
-    size = diagonal(vertices)
+    size, notes = diagonal(vertices), list[str]()
     vertices, faces = _stitch(vertices, faces, notes)
     faces, walls = _drop_inner_walls(vertices, faces)
     total = float(face_areas(vertices, faces).sum())

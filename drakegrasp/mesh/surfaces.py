@@ -282,11 +282,6 @@ def cover_triangles(triangles: Array, spacing: float) -> tuple[Array, Faces]:
 
 def compact(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     """Return a surface without its unused vertices; the other vertices keep their order."""
-    if faces.size < len(vertices):
-        few, inverse = np.unique(faces, return_inverse=True)
-        return vertices[few], inverse.reshape(-1, 3).astype(np.int64)
-
-    # The same without sorting, which would take four times the memory of the faces.
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
     return vertices[used], (np.cumsum(used) - 1)[faces].astype(np.int64)

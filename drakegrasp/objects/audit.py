@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
-from drakegrasp.mesh.crossings import crossing_faces, first_hits
+from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import (
     Faces,
     diagonal,
@@ -23,7 +22,7 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
     unit_normals,
 )
-from drakegrasp.objects.model import AHEAD, ObjectModel, forecast_memory, prepare_object
+from drakegrasp.objects.model import AHEAD, ObjectModel, prepare_object
 from drakegrasp.objects.sources import (
     UNITS,
     MeshSource,
@@ -46,29 +45,8 @@ WALL_POINTS, WALL_SHARE = 300, 0.05
 BELOW = 1e-6
 #: Densities of real objects, from foam to steel [kg/m^3].
 DENSITIES = (20.0, 8000.0)
-#: Radii of gyration of real objects, as fractions of that of their hull; sheets and shells have
-#: larger ones.
-GYRATION = (0.5, 2.0)
-#: What may help with an object without grasps, with the most helpful measure first.
-WAYS_TO_GRASPS = (
-    "palm poses that face the surface (--set candidates.method=normals), or more resting poses "
-    "(--set objects.resting_poses=4), or another hand (--set hand=NAME)"
-)
-#: Number of faces up to which self-intersections are searched; more would take minutes.
-MOST_CROSSED = 60_000
-#: Number of points among which two opposed sides are searched, and the factor by which the distance
-#: of two such points may exceed that of the sides, since they are not exactly opposite.
-SIDE_POINTS, SIDE_SLACK = 500, 1.1
-#: Sides of an object are opposed if the dot product of their outward normals is at most this.
-OPPOSED = -0.3
-#: Objects get a warning if they are lower than this fraction of the height that a hand facing the
-#: table needs; a hand that tilts gets a little lower. Measured, see docs/explanation/sampling.md.
-LOW_SHARE = 0.85
 #: Fraction of the volume that a repair may change without a warning.
 NOTED_CHANGE = 0.02
-#: Memory of scenes, distances and renderer [B]: for any object, per face of the contact mesh, and
-#: per face of the solid; measured on spheres of 1,280 to 20,480 faces.
-BASE_MEMORY, COLLISION_MEMORY, VISUAL_MEMORY = 98e6, 5.3e3, 0.3e3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,16 +67,11 @@ class AuditRow:
             with the given unit; None if it does, or if no unit fits.
         volume: Volume of the solid [m^3].
         volume_change: Volume that repair added to that within the file's faces, as a fraction.
-        crossing: Number of faces of the solid that pass through others.
         wall: Thickness [m] that 95 % of the walls have.
         mass: Mass of the object [kg].
         density: Density of the object [kg/m^3].
-        gyration: Radius of gyration over that of the convex hull.
         collision_faces: Number of faces for contact.
         collision_error: Largest distance of these faces from the solid [m].
-        memory: Memory of a worker for this object, besides its usual memory [B].
-        preparing: Maximum total memory of a worker while it prepares the mesh [B].
-        width: Smallest distance of two opposed sides [m], see `least_width`.
         model: The object.
     """
 
@@ -114,16 +87,11 @@ class AuditRow:
     units_guess: str | None = None
     volume: float | None = None
     volume_change: float | None = None
-    crossing: int | None = None
     wall: float | None = None
     mass: float | None = None
     density: float | None = None
-    gyration: float | None = None
     collision_faces: int | None = None
     collision_error: float | None = None
-    memory: float | None = None
-    preparing: float | None = None
-    width: float | None = None
     model: ObjectModel | None = field(default=None, repr=False, compare=False)
 
     def to_json(self) -> dict[str, Any]:
@@ -136,8 +104,6 @@ def audit(
     *,
     units: str = "m",
     manifest: str | Path | None = None,
-    opening: float = np.inf,
-    flat: tuple[float, float] = (0.0, 0.0),
     progress: Report = silent,
 ) -> list[AuditRow]:
     """Return for each mesh whether it is fit to be simulated, needs repair, or is rejected.
@@ -148,9 +114,6 @@ def audit(
         directory: Directory of the meshes, as for `find_meshes`.
         units: Unit of length of the meshes.
         manifest: YAML file of the meshes, if it is not in the same folder.
-        opening: Largest distance of the hand's fingertips [m], see `hand.kinematics.opening`;
-            objects that are wider everywhere get a warning.
-        flat: See `hand.kinematics.flat_limits` [m]; objects that are lower also get a warning.
         progress: Called for each mesh.
 
     Raises:
@@ -158,12 +121,12 @@ def audit(
     """
     sources, rows = find_meshes(directory, units=units, manifest=manifest), list[AuditRow]()
     for source in sources:
-        rows.append(_audit_one(source, opening, flat))
+        rows.append(_audit_one(source))
         progress(len(rows), len(sources))
     return rows
 
 
-def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) -> AuditRow:
+def _audit_one(source: MeshSource) -> AuditRow:
     """Return the row of a mesh: what the file contains, then what a build makes of it."""
     known: dict[str, Any] = {"name": source.name, "class_name": source.class_name}
     try:
@@ -177,7 +140,6 @@ def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) ->
     pieces, _ = face_components(pair_half_edges(vertices, faces, radial=False), len(faces))
     known |= {
         "faces": len(faces),
-        "preparing": forecast_memory(len(faces)),
         "bodies": pieces,
         "watertight": is_solid_surface(faces),
         "extents": (x, y, z),
@@ -194,7 +156,7 @@ def _audit_one(source: MeshSource, opening: float, flat: tuple[float, float]) ->
         known["units_guess"] = guess_units(diagonal(model.visual_vertices), source.scale)
         status: Status = "repaired" if model.notes else "fit"
         row = AuditRow(**known, status=status, notes=model.notes, model=model)
-    return replace(row, warnings=tuple(_warnings(row, opening, *flat)))
+    return replace(row, warnings=tuple(_warnings(row)))
 
 
 def _reason(error: MeshError, source: MeshSource) -> tuple[str]:
@@ -233,59 +195,30 @@ def wall_thickness(vertices: Array, faces: Faces) -> float:
     return float(np.quantile(through[np.isfinite(through)], WALL_SHARE))
 
 
-def least_width(vertices: Array, faces: Faces) -> float:
-    """Return the smallest distance of two opposed sides of a solid [m], which a hand must span.
-
-    It is searched among evenly spread points of the surface, so it is slightly too large.
-
-    Args:
-        vertices: (n, 3) [m].
-        faces: (m, 3).
-    """
-    p, picked = on_faces(vertices, faces, even_points(SIDE_POINTS))
-    n = unit_normals(vertices[faces[picked]])
-    between = p[None] - p[:, None]  # (i, j): from point i to point j
-    # The solid is between them if each normal points away from the other point.
-    outward = np.einsum("ik,ijk->ij", n, between) < 0.0
-    opposed = (n @ n.T <= OPPOSED) & outward & outward.T
-    return float(np.sqrt(np.sum(between**2, axis=2)[opposed].min(initial=np.inf)))
-
-
 def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, Any]:
     """Return measures of an object and of its file's surface, vertices (n, 3) [m], faces (m, 3)."""
-    # Volume within the file's surface, inertia of the hull per mass, and size of the solid.
+    # Volume within the file's surface, and size of the solid.
     own, solid = model.visual_vertices, model.visual_faces.astype(np.int64)
     before = abs(signed_volume(vertices, faces))
-    hull = trimesh.Trimesh(own, solid, process=False).convex_hull
-    round_hull = hull.moment_inertia / hull.volume
     x, y, z = np.ptp(own, axis=0).tolist()
 
     return {
         "extents": (x, y, z),
         "volume": model.volume,
         "volume_change": model.volume / before - 1.0 if model.notes and before > 0.0 else 0.0,
-        "crossing": len(crossing_faces(own, solid)) if len(solid) <= MOST_CROSSED else None,
         "wall": wall_thickness(own, solid),
-        "width": least_width(own, solid),
         "mass": model.mass,
         "density": model.density,
-        "gyration": float(np.sqrt(np.trace(model.I_OOcm_O) / model.mass / np.trace(round_hull))),
         "collision_faces": len(model.collision_faces),
         "collision_error": model.collision_error,
-        "memory": BASE_MEMORY
-        + COLLISION_MEMORY * len(model.collision_faces)
-        + VISUAL_MEMORY * len(solid),
     }
 
 
-def _warnings(row: AuditRow, opening: float, height: float, width: float) -> Iterator[str]:
+def _warnings(row: AuditRow) -> Iterator[str]:
     """Yield possible problems of an object that a build would accept.
 
     Args:
         row: The object; unknown values yield no warning.
-        opening: Largest distance of the hand's fingertips [m].
-        height: Smallest height for a hand that faces the table [m].
-        width: Width [m] below which an object may be lower.
     """
     if row.units_guess is not None:
         yield f"its lengths may be in {row.units_guess}"
@@ -297,22 +230,5 @@ def _warnings(row: AuditRow, opening: float, height: float, width: float) -> Ite
         )
     if row.density is not None and not DENSITIES[0] <= row.density <= DENSITIES[1]:
         yield f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density"
-    if row.gyration is not None and not GYRATION[0] <= row.gyration <= GYRATION[1]:
-        yield f"its inertia is {row.gyration**2:.2g} times that of its hull"
-    if row.crossing:
-        yield f"{row.crossing} faces pass through others"
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:
         yield f"repair changed the volume by {row.volume_change:+.0%}"
-
-    # The fingertips cannot meet two opposed sides; fingers beside a low object meet the table.
-    if row.width is not None and row.width > SIDE_SLACK * opening:
-        yield (
-            f"its opposed sides are at least {row.width * 1e3:.0f} mm apart, and the hand opens "
-            f"{opening * 1e3:.0f} mm: another unit, or a larger hand"
-        )
-    least = LOW_SHARE * height
-    if row.extents is not None and row.extents[2] < least and min(row.extents[:2]) < width:
-        yield (
-            f"its height must be {least * 1e3:.0f} mm for a hand that faces the table, got "
-            f"{row.extents[2] * 1e3:.0f} mm: {WAYS_TO_GRASPS}"
-        )

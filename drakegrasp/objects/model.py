@@ -10,7 +10,6 @@ mesh is rejected with a `MeshError`.
 from __future__ import annotations
 
 import io
-import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +26,7 @@ from drakegrasp.foreign_files import is_name, read_npz
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
-from drakegrasp.mesh.remeshing import MOST_FACES, coarsen, decimate, resting_hull
+from drakegrasp.mesh.remeshing import coarsen, decimate, resting_hull
 from drakegrasp.mesh.repair import repair_solid
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import (
@@ -427,25 +426,3 @@ def fit_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> ContactFit
     cosine = np.maximum(dot(n, mesh.face_normals[own]), dot(n, mesh.face_normals[ahead]))
     fit.normal_angle[there] = np.where(known, np.arccos(np.clip(cosine, -1.0, 1.0)), np.pi)
     return fit
-
-
-#: Memory of a worker that prepares a small mesh [B], of which 240 MB are in use before; and memory
-#: for each face that is repaired and that is read. These are the maxima over balls of 20,000 to
-#: 1,300,000 faces in STL, OBJ and PLY, with 30 MB for the worker's other data.
-BASE, MENDED, READ = 425e6, 0.6e3, 0.14e3
-#: Fraction of its limit at which Dask ends a worker, and step of the limits that are reported [B].
-ENDED, STEP = 0.95, 50e6
-
-
-def forecast_memory(faces: int) -> float:
-    """Return the maximum memory that a worker needs to prepare a mesh [B].
-
-    Args:
-        faces: Number of triangles in the file.
-    """
-    return BASE + MENDED * min(faces, MOST_FACES) + READ * faces
-
-
-def needed_limit(memory: float) -> float:
-    """Return the limit of a worker's memory [B] that allows it to use a given amount [B]."""
-    return STEP * math.ceil(memory / ENDED / STEP)

@@ -17,8 +17,8 @@ licence of the meshes, and properties that a file of triangles cannot specify:
       7_scan: {scale: 1.02, up: +y, density: 700}
       8_scan_bent: {group: 7_scan}
 
-Objects of a group come from one mesh, as morphs do: a split by object keeps them together. The
-group of an object that names none is its own name.
+Objects of a group are variants of one mesh: a split by object keeps them together. The group of an
+object that names none is its own name.
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ from drakegrasp.config import Licence, Positive, describe_mistake
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.foreign_files import NAME_RULE, is_name, read_text
 from drakegrasp.frames import Array
-from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
-from drakegrasp.runtime.environment import release_memory
+from drakegrasp.mesh.loading import SUFFIXES, clean_triangles, parse_mesh, read_bytes
 from drakegrasp.yaml_text import parse_yaml
 
 #: Metres per unit of length of a file.
@@ -308,9 +307,6 @@ def load_source(
     """
     content, digest = read or read_source(source)
     vertices, faces = parse_mesh(source.path.name, content)
-    del content
-    if len(faces) > MANY_FACES:
-        release_memory()
     return clean_triangles(vertices, faces, source.path.name), digest
 
 

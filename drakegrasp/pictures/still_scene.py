@@ -53,7 +53,7 @@ from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.shapes import hull_corners
-from drakegrasp.mesh.loading import join_scene, load_scene
+from drakegrasp.mesh.loading import load_surface
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import Picture, object_colour
@@ -403,7 +403,7 @@ def _file_mesh(inspector: SceneGraphInspector, geometry: GeometryId, shape: Mesh
     path = Path(str(source.path())) if source.is_path() else None
     if path is not None and path.is_file():
         try:
-            mesh = trimesh.Trimesh(*join_scene(load_scene(path)), process=False)
+            mesh = trimesh.Trimesh(*load_surface(path), process=False)
             return mesh.apply_scale(shape.scale3())
         except MeshError:
             pass

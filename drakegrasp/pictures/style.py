@@ -219,7 +219,7 @@ def frame_image(axes: Axes, height: int, width: int) -> None:
 
 
 def shortened(name: str, most: int) -> str:
-    """Return a name in at most `most` characters; the end distinguishes morphs of one mesh."""
+    """Return a name in at most `most` characters; the end distinguishes variants of one mesh."""
     return name if len(name) <= most else f"{name[: most - 10]}…{name[-9:]}"
 
 

@@ -62,13 +62,11 @@ files cover them, which `check` verifies.
 Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/`, `hand/` and
 `manifest.json`, every trial can be replayed.
 
-`hand/` is copied when a build begins, and read by workers and by every later command. Files in or
-below the folder of the hand file keep their places and bytes. If a model names files by an absolute
-path, by a path that leads out of its folder, or by `package://`, the model is rewritten, and these
-files are stored in `hand/files/`. `versions` in the manifest contains a digest of hand file, model
-and meshes without their paths. A build continues with a hand of the same digest, wherever
-the hand is and whatever the name of its file; `merge` requires the same digest, and `check`
-compares it.
+`hand/` is copied when a build begins, and read by workers and by every later command. The files
+keep their places, below the folder of the hand file, and bytes. `versions` in the manifest contains
+a digest of hand file, model and meshes without their paths. A build continues with a hand of the
+same digest, wherever the hand is and whatever the name of its file; `merge` requires the same
+digest, and `check` compares it.
 """
 
 _CONTRACT = """## What makes two files equal

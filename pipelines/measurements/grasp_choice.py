@@ -49,7 +49,7 @@ from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.mesh.cloud import read_cloud
-from drakegrasp.mesh.crossings import seen_points
+from drakegrasp.mesh.rays import seen_points
 from drakegrasp.mesh.surfaces import even_points, on_faces
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.protocols.postures import prepare_trials, verify_postures

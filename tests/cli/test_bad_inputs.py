@@ -359,15 +359,14 @@ def test_configurations(base: Path, tmp_path: Path) -> None:
 
 
 AUDIT = "audit {meshes} --json {to}/a.json"
-MORPH = "objects morph {meshes} --per-mesh 1 --out {to}/morphs"
 
 
 @pytest.mark.parametrize(
     ("command", "share"),
     [
         ("build --objects {meshes} --out {to}/out --dry-run", 1),
-        *((AUDIT, 4), (MORPH, 4)),  # the same function reads the file for them
-        *(in_second_tier((command, 1)) for command in (AUDIT, MORPH)),
+        (AUDIT, 4),  # the same function reads the file for it
+        in_second_tier((AUDIT, 1)),
     ],
 )
 def test_objects_yaml(base: Path, tmp_path: Path, command: str, share: int) -> None:

@@ -221,7 +221,7 @@ def test_a_reader_that_closes_the_pipe_sees_no_error() -> None:
 
 
 def test_help_fits_into_80_columns_and_is_not_cut() -> None:
-    groups = {"objects": ("list", "export", "morph"), "hand": ("list", "new", "check")}
+    groups = {"objects": ("list", "export"), "hand": ("list", "new", "check")}
     pages = [
         [],
         *(
@@ -393,18 +393,6 @@ def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:
     assert total == "2 meshes: 1 fit, 0 repaired, 1 refused; 0 with a warning (!)"
     rows = {row["name"]: row for row in json.loads(found.read_text())}
     assert rows["1_box_a"]["status"] == "fit" and rows["1_box_a"]["faces"] == 12
-
-
-def test_morphs_are_told_and_bad_directories_are_refused(tmp_path: Path) -> None:
-    meshes, out = tmp_path / "m", tmp_path / "out"
-    meshes.mkdir()
-    trimesh.creation.box([0.05, 0.06, 0.07]).export(meshes / "1_box_a.obj")
-    result = run("objects", "morph", meshes, "--per-mesh", 2, "--out", out)
-    assert result.exit_code == 0
-    assert result.stdout.startswith(f"2 morphs in {out}; ")
-    again = run("objects", "morph", meshes, "--per-mesh", 2, "--out", out)
-    assert again.exit_code != 0
-    assert "must be new or an empty directory" in error_line(again)
 
 
 # Verify

@@ -17,8 +17,6 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand_setup.check import LINES, check_grasp, trial_grasps
-from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.trial import TrialRecord
 
 
 def changed_franka(folder: Path, edit: Callable[[dict], None]) -> Hand:
@@ -74,34 +72,6 @@ def test_objects_hang_with_the_line_at_its_angle_and_the_hand_above_the_table() 
 def test_a_ball_is_left_out_if_the_fingers_stand_wider_than_it() -> None:
     found = check_grasp(load_hand("allegro_four"), load_config(), "sphere")
     assert (found.ok, found.text) == (True, "left out: the fingers stand too wide for a ball")
-
-
-def outcome(monkeypatch: pytest.MonkeyPatch, record: Callable[..., TrialRecord]) -> Finding:
-    module = "drakegrasp.hand_setup.check"
-    monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)
-    monkeypatch.setattr(f"{module}.run_attempt", record)
-    return check_grasp(load_hand("franka"), load_config(), "box")
-
-
-@pytest.mark.parametrize(
-    ("label", "mend"),
-    [
-        (Outcome.HAND_CONTACT, "other links touch it first"),
-        (Outcome.START_COLLISION, "keep fingers that do not grasp away with preshape"),
-        (Outcome.SLIPPED, "pads must face each other"),
-    ],
-)
-def test_a_grasp_that_fails_says_what_may_mend_it(
-    monkeypatch: pytest.MonkeyPatch, label: Outcome, mend: str
-) -> None:
-    found = outcome(
-        monkeypatch, lambda scene, X_TO, attempt, rules: TrialRecord(
-            outcome=label, X_TO=X_TO, X_OG=attempt.X_OG
-        )
-    )  # fmt: skip
-    assert not found.ok
-    assert f"a box must be held, got 3 {label.label}: " in found.text
-    assert mend in found.text
 
 
 @pytest.mark.sim

@@ -23,13 +23,13 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
-from drakegrasp.hand import description
+from drakegrasp.hand import folder
+from drakegrasp.hand.checks import overlap_query
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Coupling
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
-from drakegrasp.hand.overlaps import overlap_query
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import link_shapes
 
@@ -253,17 +253,18 @@ def test_a_process_keeps_the_hands_that_it_used_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One that drafts many hands or loads many datasets does not grow with them."""
-    monkeypatch.setattr(description, "KEPT_HANDS", 2)
-    monkeypatch.setattr(description, "_loaded", {})
-    paths = [tmp_path / name for name in "abc"]
-    for path in paths:
-        path.mkdir()
-    one, other = (load_hand(write_pincer(path)) for path in paths[:2])
-    assert load_hand(one.model.path.with_name("pincer_hand.yaml")) is one
-    load_hand(write_pincer(paths[2]))
-    assert load_hand(one.model.path.with_name("pincer_hand.yaml")) is one
-    assert load_hand(other.model.path.with_name("pincer_hand.yaml")) is not other
-    assert len(description._loaded) == 2
+    monkeypatch.setattr(folder, "KEPT", 2)
+    monkeypatch.setattr(folder, "_known", {})
+    paths = []
+    for name in "abc":
+        (tmp_path / name).mkdir()
+        paths.append(write_pincer(tmp_path / name))
+    one, other = folder.hand_folder(paths[0]), folder.hand_folder(paths[1])
+    assert folder.hand_folder(paths[0]) is one
+    folder.hand_folder(paths[2])
+    assert folder.hand_folder(paths[0]) is one
+    assert folder.hand_folder(paths[1]) is not other
+    assert len(folder._known) == 2
 
 
 def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:
@@ -325,8 +326,7 @@ REFUSALS = {
     "spreads without a spread": (
         {"spreads_deg": [0, 10]},
         r"spreads_deg must be \[0\] without spread\.joints, got \[0\.0, 10\.0\]"),
-    "no package": ({"packages": {"pincer_description": "gone"}},
-                   r"packages\.pincer_description: must be a folder, got 'gone'"),
+    "no key": ({"packages": {"kit": "gone"}}, r"packages: must be a key of a hand file"),
     "missing file": ({"model": "gone.sdf"},
                      r"model: must be an SDFormat or URDF file, got '.*gone\.sdf'"),
     "not a model": ({"model": "pincer_hand.yaml"}, r"model: must be a file of one model"),

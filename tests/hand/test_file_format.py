@@ -18,8 +18,6 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import SLIDE, load_hand
-from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import (
     closing_levers,
     coordinate_limits,
@@ -73,28 +71,6 @@ def test_motors_and_couplings_of_the_model_are_left_out(tmp_path: Path) -> None:
     plant = MultibodyPlant(0.01)
     add_model(plant, load_hand(write_pincer(tmp_path, text)).model)
     assert plant.num_actuators() == 0
-
-
-@pytest.mark.parametrize("named", [True, False])
-def test_a_mesh_in_a_package_is_found(tmp_path: Path, named: bool) -> None:
-    """By the hand file's `packages`, or by the package.xml above the model."""
-    folder = tmp_path / "somewhere" / "meshes"
-    folder.mkdir(parents=True)
-    mesh = (MODELS / "barrett_distal.obj").read_text()
-    (folder / "tip.obj").write_text(mesh)
-    (folder.parent / "package.xml").write_text("<package><name> grip </name></package>")
-    uri = '<mesh filename="package://grip/meshes/tip.obj"/>'
-    urdf = SLIDER.replace('<box size="0.02 0.02 0.09"/>', uri, 1)
-    if named:
-        path = write_slider(tmp_path, urdf, packages={"grip": "somewhere"})
-    else:
-        path = write_slider(folder.parent, urdf)
-    assert len(link_shapes(load_hand(path).model)["left"][0]) == 24
-
-    # The mesh is part of the hand.
-    before = hand_digest(path)
-    (folder / "tip.obj").write_text(mesh + "# changed\n")
-    assert hand_digest(path) != before
 
 
 def test_a_mesh_that_is_missing_is_named(tmp_path: Path) -> None:

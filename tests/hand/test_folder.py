@@ -1,4 +1,4 @@
-"""A hand in a folder of its own is the same hand, whatever its model named before."""
+"""A hand in another folder is the same hand."""
 
 from __future__ import annotations
 
@@ -32,26 +32,13 @@ def with_mesh(uri: str) -> str:
     )
 
 
-def write_layout(root: Path, layout: str) -> Path:
-    """Write the gripper with its mesh in one of the ways in which models are laid out."""
-    folders = {name: root / name for name in ("mine", "vendor/urdf", "vendor/meshes")}
-    for folder in folders.values():
-        folder.mkdir(parents=True)
-    mesh = folders["vendor/meshes"] / "palm.obj"
-    write(mesh, box((0.04, 0.12, 0.02)))
-    (root / "vendor" / "package.xml").write_text("<package><name>kit</name></package>")
-    model, uri, packages = {
-        "beside": ("pincer.sdf", "palm.obj", {}),
-        "above": ("../vendor/urdf/pincer.sdf", "../meshes/palm.obj", {}),
-        "absolute": (str(root / "vendor/urdf/pincer.sdf"), f"file://{mesh}", {}),
-        "package": ("../vendor/urdf/pincer.sdf", "package://kit/meshes/palm.obj", {}),
-        "named package": ("pincer.sdf", "package://other/meshes/palm.obj", {"other": "../vendor"}),
-    }[layout]
-    if layout == "beside":
-        shutil.copy(mesh, folders["mine"])
-    named = {"packages": packages} if packages else {}
-    path = write_pincer(folders["mine"], model=model, **named)
-    (folders["mine"] / model).write_text(with_mesh(uri))
+def write_layout(root: Path, mesh: str = "palm.obj") -> Path:
+    """Write the gripper, with a mesh of its palm in a place below it."""
+    folder = root / Path(mesh).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    write(root / mesh, box((0.04, 0.12, 0.02)))
+    path = write_pincer(root)
+    (root / "pincer.sdf").write_text(with_mesh(mesh))
     return path
 
 
@@ -62,16 +49,13 @@ def carried_source(out: Path, config: Config) -> CarriedHand:
     return source
 
 
-@pytest.mark.parametrize("layout", ["beside", "above", "absolute", "package", "named package"])
-def test_the_copy_loads_by_itself_as_the_same_hand(layout: str, tmp_path: Path) -> None:
-    path = write_layout(tmp_path / "there", layout)
-    path.write_text(f"# Measured by hand.\n{path.read_text()}")
+@pytest.mark.parametrize("mesh", ["palm.obj", "./meshes/../meshes/palm.obj"])
+def test_the_copy_loads_by_itself_as_the_same_hand(mesh: str, tmp_path: Path) -> None:
+    path = write_layout(tmp_path / "there", mesh)
     known, digest = load_hand(path), hand_digest(path)
     shapes = link_shapes(known.model)
     copy = carried_source(tmp_path / "out", load_config(hand=str(path)))
     assert copy.digest == digest == hand_digest(copy)
-
-    assert copy.path.read_text().startswith("# Measured by hand.\n")
 
     shutil.rmtree(tmp_path / "there")
     hand = load_hand(copy)
@@ -86,9 +70,27 @@ def test_the_copy_loads_by_itself_as_the_same_hand(layout: str, tmp_path: Path) 
     assert hand_digest(again) == digest
 
 
+@pytest.mark.parametrize(
+    ("model", "mesh"),
+    [
+        ("../pincer.sdf", "palm.obj"),
+        ("{}/pincer.sdf", "palm.obj"),
+        ("pincer.sdf", "../palm.obj"),
+        ("pincer.sdf", "file://{}/palm.obj"),
+        ("pincer.sdf", "package://kit/palm.obj"),
+    ],
+)
+def test_a_hand_of_several_folders_is_refused(model: str, mesh: str, tmp_path: Path) -> None:
+    path = write_pincer(tmp_path)
+    (tmp_path / "pincer.sdf").write_text(with_mesh(mesh.format(tmp_path)))
+    change(path, MODEL, f"model: {model.format(tmp_path)}")
+    with pytest.raises(HandError, match=r"must name files in it only, got .*: copy the files into"):
+        load_hand(path)
+
+
 def test_files_below_the_hand_file_keep_their_bytes(tmp_path: Path) -> None:
     folder = hand_folder("barrett")
-    for place in {*folder.texts, *folder.files}:
+    for place in folder.files:
         assert folder.content(place) == (MODELS / place).read_bytes()
     assert not folder.licences
     path = write_tongs(tmp_path)
@@ -98,15 +100,14 @@ def test_files_below_the_hand_file_keep_their_bytes(tmp_path: Path) -> None:
 
 
 def test_materials_textures_and_licences_come_along(tmp_path: Path) -> None:
-    path = write_layout(tmp_path / "there", "above")
-    meshes = tmp_path / "there" / "vendor" / "meshes"
-    mesh = meshes / "palm.obj"
+    path = write_layout(tmp_path / "there", "meshes/palm.obj")
+    mesh = path.parent / "meshes" / "palm.obj"
     mesh.write_text(f"mtllib palm.mtl\n{mesh.read_text()}")
-    (meshes / "palm.mtl").write_text("newmtl a\nmap_Kd -s 1 1 1 skin.png\n")
-    (meshes / "skin.png").write_bytes(b"a picture")
-    (path.parent / "LICENSE.txt").write_text("\nMIT License\n")
+    mesh.with_name("palm.mtl").write_text("newmtl a\nmap_Kd -s 1 1 1 skin.png\n")
+    mesh.with_name("skin.png").write_bytes(b"a picture")
+    (path.parent / "pincer_LICENSE.txt").write_text("\nMIT License\n")
     folder = carried_source(tmp_path / "out", load_config(hand=str(path))).path.parent
-    (copied,) = folder.glob("files/*/palm.obj")
+    copied = folder / "meshes" / "palm.obj"
     assert copied.read_bytes() == mesh.read_bytes()
     assert (copied.parent / "skin.png").read_bytes() == b"a picture"
     assert (folder / "LICENSE.txt").read_text() == "\nMIT License\n"
@@ -132,7 +133,6 @@ FAULTS = {
     "a model above": ("pincer_hand.yaml", MODEL, "model: ../secret.sdf"),
     "a mesh above": ("pincer.sdf", "palm.obj", "../palm.obj"),
     "an absolute mesh": ("pincer.sdf", "palm.obj", "file://{}/palm.obj"),
-    "packages": ("pincer_hand.yaml", MODEL, f"packages: {{{{a: ..}}}}\n{MODEL}"),
     "a large hand file": ("pincer_hand.yaml", MODEL, MODEL + " " * 300_000),
     "a package": ("pincer.sdf", "palm.obj", "package://a/b.obj"),
     "a material above": ("palm.obj", "v ", "mtllib ../a.mtl\nv "),
@@ -156,7 +156,7 @@ FAULTS = {
 def test_a_stranger_s_hand_stays_in_its_folder(
     fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = write_layout(tmp_path / "there", "beside")
+    path = write_layout(tmp_path / "there")
     copy = carried_source(tmp_path / "out", load_config(hand=str(path)))
     for name in ("secret.sdf", "palm.obj", "secret.yaml"):
         (tmp_path / "out" / name).write_text("nothing")
@@ -180,7 +180,7 @@ def test_a_stranger_s_hand_stays_in_its_folder(
 def test_a_hand_that_is_too_large_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = write_layout(tmp_path, "beside")
+    path = write_layout(tmp_path)
     monkeypatch.setattr("drakegrasp.hand.folder.LARGEST", 1500)
     with pytest.raises(HandError, match="must be at most 1000 and 0 MB in all, its YAML 256 kB"):
         hand_folder(path)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from helpers.hands import copy_model
 from helpers.successes import good, judge
 
 from drakegrasp.config import CandidateConfig, FilterConfig
@@ -20,7 +21,6 @@ from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import TrialSetup, trial_rows
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
-from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
@@ -55,8 +55,7 @@ REFUSALS = {
 
 def allegro(folder: Path, *preshapes: dict, name: str = "allegro_four") -> Hand:
     """Return a hand of the package with preshapes."""
-    tree = yaml.safe_load(hand_file(name).read_text())
-    tree |= {"model": str(load_hand(name).model.path), "preshapes": list(preshapes)}
+    tree = copy_model(folder, name) | {"preshapes": list(preshapes)}
     path = folder / "shaped_hand.yaml"
     path.write_text(yaml.safe_dump(tree))
     return load_hand(path)

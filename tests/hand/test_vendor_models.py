@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.mesh_files import CUBE, READ, REFUSED, dae, obj, write_file
+from helpers.mesh_files import READ, REFUSED, write_file
 from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
 
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.source import read_model
-from drakegrasp.hand.draft.urdf import write_urdf
 from drakegrasp.hand_setup.new import draft_hand
 from drakegrasp.objects.audit import audit
 
@@ -22,11 +21,11 @@ JAW_BOX = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
 MESH = '<geometry><mesh filename="{}"/></geometry>'
 
 
-def with_mesh(uri: str, tag: str = "visual") -> str:
-    """Return the jaws, the left one's collision shape or picture a mesh."""
-    old = f'<{tag}><origin xyz="0 0.006 0.03"/>{JAW_BOX}</{tag}>'
+def with_mesh(uri: str) -> str:
+    """Return the jaws, the left one's collision shape a mesh."""
+    old = f'<collision><origin xyz="0 0.006 0.03"/>{JAW_BOX}'
     assert old in JAWS
-    return JAWS.replace(old, f'<{tag}><origin xyz="0 0.006 0.03"/>{MESH.format(uri)}</{tag}>')
+    return JAWS.replace(old, f'<collision><origin xyz="0 0.006 0.03"/>{MESH.format(uri)}')
 
 
 def test_frames_without_mass_become_part_of_their_parents(tmp_path: Path) -> None:
@@ -217,7 +216,7 @@ TIP = '<geom type="box" size="0.01 0.006 0.03" pos="0 0.006 0.03"'
 def test_shapes_of_mjcf_are_those_that_mujoco_compiles(
     tmp_path: Path, changes: dict[str, str], low: tuple[int, ...], high: tuple[int, ...]
 ) -> None:
-    """Bounds in [mm]; the mass stays, and the picture has the same shape."""
+    """Bounds in [mm]; the mass stays."""
     pytest.importorskip("mujoco")
     for suffix in ("stl", "obj", "glb"):
         write_mesh(tmp_path / f"jaw.{suffix}")
@@ -226,31 +225,29 @@ def test_shapes_of_mjcf_are_those_that_mujoco_compiles(
         assert old in text
         text = text.replace(old, new)
     link = read_model(write_model(tmp_path, text, "hand.xml")).links["left_jaw"]
-    for (shape,) in (link.collisions, link.visuals):
-        corners = 1e3 * shape.corners()
-        np.testing.assert_allclose(corners.min(axis=0), low, atol=0.3)
-        np.testing.assert_allclose(corners.max(axis=0), high, atol=0.3)
+    (shape,) = link.collisions
+    corners = 1e3 * shape.corners()
+    np.testing.assert_allclose(corners.min(axis=0), low, atol=0.3)
+    np.testing.assert_allclose(corners.max(axis=0), high, atol=0.3)
     assert link.inertia.get_mass() == pytest.approx(0.05)
 
 
-def test_shapes_of_mjcf_collide_or_are_drawn_as_in_mujoco(tmp_path: Path) -> None:
+def test_shapes_of_mjcf_collide_as_in_mujoco(tmp_path: Path) -> None:
+    """A body none of whose shapes collide has those that are drawn."""
     pytest.importorskip("mujoco")
     more = ('<geom size="0.001" contype="0" conaffinity="0"/><geom size="0.002" group="3"/>'
-            '<geom size="0.003" contype="0" rgba="1 0 0 0"/>'
-            '<geom size="0.004" material="red"/>')  # fmt: skip
-    text = JAWS_MJCF.replace(TIP, more + TIP).replace(
-        "<worldbody>", '<asset><material name="red" rgba="1 0 0 1"/></asset><worldbody>'
-    )
+            '<geom size="0.003" contype="0"/>')  # fmt: skip
+    text = JAWS_MJCF.replace(TIP, more + TIP)
     text = text.replace('<body name="body">', '<body name="body"><geom type="plane" size="1 1 1"/>')
     model = read_model(write_model(tmp_path, text, "hand.xml"))
-    link = model.links["left_jaw"]
-    sizes = [
-        [round(1e3 * float(s.corners().max(axis=0)[0])) for s in shapes]
-        for shapes in (link.collisions, link.visuals)
-    ]
-    assert sizes == [[2, 3, 4, 10], [1, 4, 10]]
-    assert [s.colour.tolist() for s in link.visuals] == [[0.5] * 3, [1.0, 0.0, 0.0], [0.5] * 3]
+    shapes = model.links["left_jaw"].collisions
+    assert [round(1e3 * float(s.corners().max(axis=0)[0])) for s in shapes] == [2, 3, 10]
     assert model.notes == ("link body: a shape of type plane is not kept",)
+
+    drawn = JAWS_MJCF.replace(TIP, TIP.replace("<geom", '<geom contype="0" conaffinity="0"'))
+    model = read_model(write_model(tmp_path, drawn, "drawn.xml"))
+    assert len(model.links["left_jaw"].collisions) == 1
+    assert "link left_jaw: the model has no collision shapes; hulls of its pictures" in model.notes
 
 
 def test_a_draft_of_mjcf_is_urdf_that_needs_no_mujoco(
@@ -308,22 +305,6 @@ def test_a_class_of_mjcf_has_what_all_classes_around_it_say(tmp_path: Path) -> N
         assert joint.effort == plain.joints[name].effort
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb"])
-def test_meshes_of_many_formats_are_drawn(tmp_path: Path, suffix: str) -> None:
-    """Their triangles are written beside the model, with the colour of their material."""
-    write_mesh(tmp_path / "in" / "meshes" / f"jaw{suffix}")
-    model = read_model(write_model(tmp_path / "in", with_mesh(f"meshes/jaw{suffix}")))
-    (shape,) = model.links["left_jaw"].visuals
-    np.testing.assert_allclose(shape.corners().max(axis=0), [0.01, 0.012, 0.06], atol=1e-6)
-    out = tmp_path / "out" / "hand.urdf"
-    write_urdf(model, out, [])
-    assert len(list((out.parent / "meshes").glob("*visual*.obj"))) == 1
-    again = read_model(out)
-    assert len(again.links["left_jaw"].visuals) == 1
-    if suffix == ".glb":
-        np.testing.assert_allclose(again.links["left_jaw"].visuals[0].colour, [1.0, 0.15, 0.15])
-
-
 @pytest.mark.parametrize("case", [*READ, *REFUSED])
 def test_a_hand_reads_the_mesh_files_that_objects_read(tmp_path: Path, case: str) -> None:
     """And refuses the others in the same words: there is one door for meshes."""
@@ -333,7 +314,7 @@ def test_a_hand_reads_the_mesh_files_that_objects_read(tmp_path: Path, case: str
     write_file(folder, name, content)
     (row,) = audit(folder, units="cm")
     mesh = f'<mesh filename="meshes/{name}" scale="0.02 0.02 0.02"/>'
-    text = with_mesh("", "collision").replace('<mesh filename=""/>', mesh)
+    text = with_mesh("").replace('<mesh filename=""/>', mesh)
     path = write_model(tmp_path, text.replace('xyz="0 0.006 0.03"', 'xyz="0 0 0"', 1))
     if case in REFUSED:
         assert row.status == "refused"
@@ -347,40 +328,12 @@ def test_a_hand_reads_the_mesh_files_that_objects_read(tmp_path: Path, case: str
     np.testing.assert_allclose(size, 2.0 * np.array(row.extents), atol=1e-6)
 
 
-def test_a_picture_has_the_colour_of_a_material_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "jaw.mtl").write_text("newmtl red\nKd 1 0 0\n")
-    (tmp_path / "other.mtl").symlink_to(tmp_path / "lost.mtl")
-    (tmp_path.parent / "far.mtl").write_text("newmtl red\nKd 0 0 1\n")
-    for name, colour in (("jaw.mtl", [1.0, 0.15, 0.15]), ("../far.mtl", None), ("lost.mtl", None)):
-        write_file(tmp_path, "jaw.obj", f"mtllib {name}\nusemtl red\n" + obj(CUBE / 20))
-        (shape,) = read_model(write_model(tmp_path, with_mesh("jaw.obj"))).links["left_jaw"].visuals
-        found = None if shape.colour is None else shape.colour.tolist()
-        assert found == colour or (colour is None and found != [0.15, 0.15, 1.0])
-
-
-def test_a_picture_in_collada_has_the_unit_of_its_file(tmp_path: Path) -> None:
-    pytest.importorskip("collada")
-    write_file(tmp_path, "jaw.dae", dae('<unit meter="0.001"/>', 60.0 * CUBE))
-    (shape,) = read_model(write_model(tmp_path, with_mesh("jaw.dae"))).links["left_jaw"].visuals
-    np.testing.assert_allclose(np.ptp(shape.corners(), axis=0), 0.06)
-
-
-def test_a_picture_that_cannot_be_read_is_left_out_and_said(tmp_path: Path) -> None:
-    """Collision shapes are drawn in its place."""
-    model = read_model(write_model(tmp_path, with_mesh("meshes/lost.stl")))
-    assert model.links["left_jaw"].visuals == ()
-    assert len(model.links["left_jaw"].collisions) == 1
-    (note,) = model.notes
-    assert note.startswith("not drawn: mesh")
-    assert "lost.stl" in note
-
-
 def test_a_collision_mesh_is_a_hull_of_few_corners(tmp_path: Path) -> None:
     import trimesh
 
     ball = trimesh.creation.icosphere(4, 0.02)
     ball.export(tmp_path / "ball.stl")
-    model = read_model(write_model(tmp_path, with_mesh("ball.stl", "collision")))
+    model = read_model(write_model(tmp_path, with_mesh("ball.stl")))
     (shape,) = model.links["left_jaw"].collisions
     assert shape.vertices is not None
     assert len(shape.vertices) <= 70
@@ -405,7 +358,7 @@ def test_a_link_without_a_mass_gets_one_by_its_size(tmp_path: Path) -> None:
 
 def test_packages_are_folders_above_or_given_ones(tmp_path: Path) -> None:
     write_mesh(tmp_path / "pkg" / "meshes" / "jaw.stl")
-    text = with_mesh("package://pkg/meshes/jaw.stl", "collision")
+    text = with_mesh("package://pkg/meshes/jaw.stl")
     inside = write_model(tmp_path / "pkg" / "urdf", text)
     assert read_model(inside).links["left_jaw"].collisions[0].vertices is not None
     outside = write_model(tmp_path / "elsewhere", text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 import yaml
 
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import Hand
 from drakegrasp.hand.files import hand_file
+from drakegrasp.hand.folder import hand_folder
 from drakegrasp.pictures.still_scene import Poses, StillScene
 
 #: A gripper whose two fingers face each other along y, hinged at y = -+0.04, length 0.1.
@@ -166,7 +168,7 @@ def write_tongs(folder: Path) -> Path:
 
 def write_with_optional_fingers(folder: Path, *fingers: int) -> Path:
     """Write the Barrett Hand's YAML with fingers that need not touch, and return its path."""
-    tree = _barrett()
+    tree = copy_model(folder, "barrett")
     for k in fingers:
         tree["fingers"][k]["required"] = False
     path = folder / "optional_hand.yaml"
@@ -178,10 +180,14 @@ def write_with_preshapes(folder: Path, **preshapes: str) -> Path:
     """Write the Barrett Hand's YAML with preshapes by the names of their fingers: `"F1 F3"`."""
     shapes = [{"name": name, "fingers": fingers.split()} for name, fingers in preshapes.items()]
     path = folder / "shaped_hand.yaml"
-    path.write_text(yaml.safe_dump(_barrett() | {"preshapes": shapes}))
+    path.write_text(yaml.safe_dump(copy_model(folder, "barrett") | {"preshapes": shapes}))
     return path
 
 
-def _barrett() -> dict[str, Any]:
-    tree: dict[str, Any] = yaml.safe_load(hand_file("barrett").read_text())
-    return tree | {"model": str(load_hand("barrett").model.path)}
+def copy_model(folder: Path, name: str) -> dict[str, Any]:
+    """Copy the model of a hand of the package and its meshes; return the keys of the hand."""
+    tree: dict[str, Any] = yaml.safe_load(hand_file(name).read_text())
+    for place, path in hand_folder(name).files.items():
+        if not place.endswith(".yaml"):
+            shutil.copy(path, folder)
+    return tree

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from drakegrasp.mesh.loading import clean_triangles, load_surface
+
 #: Corners of the unit cube, those of another, and the faces of each, from 1.
 CUBE = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
 ASIDE = CUBE + np.array((3, 0, 0))
@@ -24,6 +26,11 @@ OUTLINES = {
     "doubled": [(0, 0), (9, 0), (9, 8), (7, 8), (7, 8), (7, 2), (2, 2), (2, 8), (0, 8)],
 }
 Polygons = Sequence[Sequence[int]]
+
+
+def load_mesh(path: Path) -> trimesh.Trimesh:
+    """Return the triangles of a mesh file, as of an object's."""
+    return clean_triangles(*load_surface(path), path.name)
 
 
 def prism(outline: list[tuple[int, int]], start: int) -> tuple[np.ndarray, Polygons]:

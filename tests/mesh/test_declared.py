@@ -15,6 +15,7 @@ from helpers.mesh_files import (
     REFUSED,
     dae,
     edited_glb,
+    load_mesh,
     obj,
     ply,
     prism,
@@ -23,7 +24,7 @@ from helpers.mesh_files import (
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.loading import join_scene, load_mesh, load_points, load_scene
+from drakegrasp.mesh.loading import load_points, load_surface
 
 
 @pytest.mark.parametrize("case", READ)
@@ -66,7 +67,7 @@ def test_concave_polygons_are_refused_whatever_their_first_corner(
 )
 def test_the_unit_that_a_file_states_applies(tmp_path: Path, unit: str, size: float) -> None:
     pytest.importorskip("collada")
-    vertices, faces = join_scene(load_scene(write_file(tmp_path, "a.dae", dae(unit))))
+    vertices, faces = load_surface(write_file(tmp_path, "a.dae", dae(unit)))
     assert len(faces) == 12
     np.testing.assert_allclose(np.ptp(vertices, axis=0), size)
 
@@ -86,7 +87,7 @@ def test_collada_that_is_not_as_declared_is_refused(
 ) -> None:
     pytest.importorskip("collada")
     with pytest.raises(MeshError, match=message):
-        load_scene(write_file(tmp_path, "a.dae", content))
+        load_surface(write_file(tmp_path, "a.dae", content))
 
 
 def test_points_are_read_from_a_file_without_faces(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers.mesh_files import load_mesh
 from helpers.meshes import (
     BOX,
     G3DB,
@@ -22,9 +23,6 @@ from hypothesis import strategies as st
 import drakegrasp.mesh.repair
 import drakegrasp.mesh.union
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.components import part_touching_edges
-from drakegrasp.mesh.loading import load_mesh
-from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     is_solid_surface,
     signed_volume,
@@ -242,38 +240,6 @@ def test_signed_volume_does_not_depend_on_the_place():
     cube = box(at=(100.0, -50.0, 7.0))
     volume = signed_volume(np.array(cube.vertices), np.array(cube.faces))
     assert volume == pytest.approx(np.prod(BOX), rel=1e-9)
-
-
-def test_touching_edge_gets_a_vertex_for_each_side():
-    """Two bricks share an edge; each keeps its own two faces at both halves of it."""
-    corner, other = box((0.02,) * 3), box((0.02,) * 3, (0.02, 0.02, 0.0))
-    vertices, faces = weld(
-        np.vstack((corner.vertices, other.vertices)), np.vstack((corner.faces, other.faces + 8))
-    )
-    assert not is_solid_surface(faces)
-    parted, new_faces = part_touching_edges(vertices, faces)
-    assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
-    np.testing.assert_allclose(parted[-2:], [[0.01, 0.01, 0.0]] * 2, atol=1e-12)
-    assert is_solid_surface(new_faces)
-    assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
-
-
-@pytest.mark.parametrize("limit", ["WELD_PART", "MOST_PACKED"])
-def test_welding_in_parts_changes_no_bit(monkeypatch, limit):
-    """A soup as in an STL file: each corner has a vertex of its own, some faces come twice."""
-    ball = trimesh.creation.icosphere(2, radius=0.05)
-    rng = np.random.default_rng(0)
-    order = np.append(rng.permutation(len(ball.faces)), [3, 3, 7])
-    soup = ball.vertices[ball.faces[order]].reshape(-1, 3)
-    soup += rng.uniform(-1e-11, 1e-11, soup.shape)
-    faces = np.arange(len(soup)).reshape(-1, 3)
-    whole = weld(soup, faces)
-    assert (len(whole[0]), len(whole[1])) == (len(ball.vertices), len(ball.faces))
-    monkeypatch.setattr(drakegrasp.mesh.repair, limit, 50)
-    parts = weld(soup, faces)
-    for one, other in zip(whole, parts, strict=True):
-        np.testing.assert_array_equal(one, other)
-        assert one.dtype == other.dtype
 
 
 def test_share_of_a_solid_that_changed_is_of_its_volume():

@@ -16,7 +16,7 @@ import drakegrasp as dg
 from drakegrasp.arithmetic import multiply
 from drakegrasp.frames import rotation_about
 from drakegrasp.hand.finger_sweep import reach
-from drakegrasp.mesh.crossings import seen_points
+from drakegrasp.mesh.rays import seen_points
 
 
 def short_hash(values: npt.ArrayLike) -> str:

@@ -12,29 +12,32 @@ import logging
 import re
 import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
+from xml.sax.saxutils import escape, unescape
 
 import numpy as np
-from pydrake.geometry import Role, SceneGraph
+from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import SpatialInertia
+from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 
-from drakegrasp.errors import HandError, first_line, one_line
+from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_content
 from drakegrasp.hand.draft.shapes import Shape, read_mesh, read_shape
 from drakegrasp.hand.draft.vendor import Link, VendorJoint, VendorModel
-from drakegrasp.hand.files import rewritten
+from drakegrasp.hand.files import REFERENCES
 from drakegrasp.hand.parsing import (
+    ModelFile,
+    add_model,
     declared_efforts,
     declared_masses,
     declared_mimics,
     impossible_inertias,
     joint_axis,
     joint_slides,
-    make_parser,
     moving_joint,
     refuse_impossible,
     refuse_other_joint,
@@ -55,8 +58,6 @@ _REFUSED = (
         "must be complete by itself, got {}: put what it names into the file",
     ),
 )
-#: Drake's warnings on parts that no hand has, or that are reported elsewhere.
-_ASIDE = re.compile("'(light|camera|sensor|transmission|gazebo)'|effort limits|inertia")
 
 
 def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
@@ -76,42 +77,44 @@ def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
     for name, mass in masses.items():
         if mass < 0.0:
             raise HandError(f"model: link {name!r} must have a mass of 0 kg or more, got {mass:g}")
-    plant, graph, meshes = MultibodyPlant(1e-3), SceneGraph(), dict[str, Shape | HandError]()
+    plant, graph, uris = MultibodyPlant(1e-3), SceneGraph(), dict[str, str]()
     plant.RegisterAsSourceForSceneGraph(graph)
     with tempfile.TemporaryDirectory() as scratch:
         copy = Path(scratch) / f"model{path.suffix.lower()}"
 
-        def convert(uri: str, is_geometry: bool) -> str:
-            return _convert(uri, path.parent, find, copy.parent, meshes) if is_geometry else uri
+        def stand_in(uri: str, is_geometry: bool) -> str:
+            # Drake must find a Wavefront file; its triangles are not used.
+            if not is_geometry:
+                return uri
+            digest = hashlib.sha256(uri.encode(errors="surrogateescape")).hexdigest()
+            uris[name := f"{digest[:16]}.obj"] = uri
+            copy.with_name(name).write_text(_STAND_IN, encoding="utf-8")
+            return name
 
-        text = rewritten(text, convert)
-        copy.write_bytes(text)
-        instance, notes = _parse(plant, copy)
+        copy.write_bytes(_rewritten(text, stand_in))
+        instance = _parse(plant, copy)
+
+    @cache
+    def find_mesh(name: str) -> Shape:
+        return read_mesh(find(uris[name], path.parent))
 
     efforts = declared_efforts(root)
-    for motor in map(plant.get_joint_actuator, plant.GetJointActuatorIndices()):
-        efforts.setdefault(motor.joint().name(), motor.effort_limit())
 
     # Bodies and joints; a joint to the world only fixes the hand.
     links = {}
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
-        name, drawn = body.name(), plant.GetVisualGeometriesForBody(body)
-        solids = plant.GetCollisionGeometriesForBody(body)
-        shapes = {
-            kind: [read_shape(graph.model_inspector(), shape, role, meshes, notes) for shape in own]
-            for kind, role, own in (
-                ("collisions", Role.kProximity, solids),
-                ("visuals", Role.kIllustration, drawn),
-            )
-        }
+        name, solid = body.name(), plant.GetCollisionGeometriesForBody(body)
+        own = solid or plant.GetVisualGeometriesForBody(body)
+        found = (read_shape(graph.model_inspector(), shape, find_mesh) for shape in own)
+        shapes = tuple(shape for shape in found if shape is not None)
+        # Drake replaces a mass of zero by its own value.
+        massless = body.default_mass() == 0.0 or masses.get(name) == 0.0
         links[name] = Link(
             name=name,
-            # Drake replaces a mass of zero by its own value.
-            inertia=SpatialInertia.Zero()
-            if body.default_mass() == 0.0 or masses.get(name) == 0.0
-            else body.default_spatial_inertia(),
+            inertia=SpatialInertia.Zero() if massless else body.default_spatial_inertia(),
             impossible=impossible.get(name, ""),
-            **{kind: tuple(s for s in own if s is not None) for kind, own in shapes.items()},
+            collisions=shapes if solid else (),
+            pictures=() if solid else shapes,
         )
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     world = plant.world_body().index()
@@ -124,7 +127,6 @@ def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
             if joint.parent_body().index() != world
         },
         mimics={mimic.joint: mimic for mimic in declared_mimics(root)},
-        notes=tuple(dict.fromkeys(notes)),
     )
 
 
@@ -143,30 +145,26 @@ def _text_of(path: Path) -> tuple[bytes, Element]:
         raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
 
 
-def _convert(
-    uri: str,
-    folder: Path,
-    find: Callable[[str, Path], Path],
-    scratch: Path,
-    meshes: dict[str, Shape | HandError],
-) -> str:
-    """Return the name of a Wavefront file that Drake reads in place of a mesh.
+def _rewritten(model: bytes, place: Callable[[str, bool], str]) -> bytes:
+    """Return the text of a model with each reference replaced.
 
     Args:
-        uri: The URI of the mesh.
-        folder: Folder of the model.
-        find: Returns the file of a URI.
-        scratch: Folder of the Wavefront files. Drake must find them; their triangles are not used.
-        meshes: Receives the content of the mesh, or why it cannot be read.
+        model: The text.
+        place: Returns the replacement of a reference. Its arguments are the reference and whether
+            it is geometry. If the replacement equals the reference, the bytes do not change.
     """
-    name = f"{hashlib.sha256(uri.encode(errors='surrogateescape')).hexdigest()[:16]}.obj"
-    if name not in meshes:
-        try:
-            meshes[name] = read_mesh(find(uri, folder))
-        except HandError as error:
-            meshes[name] = error
-        (scratch / name).write_text(_STAND_IN, encoding="utf-8")
-    return name
+
+    def replaced(match: re.Match[bytes]) -> bytes:
+        kind = str(match.lastgroup)
+        uri = unescape(match[kind].decode(errors="surrogateescape"))
+        new = place(uri, kind in ("uri", "mesh"))
+        if new == uri:
+            return match[0]
+        start, stop = (position - match.start() for position in match.span(kind))
+        written = escape(new).encode(errors="surrogateescape")
+        return match[0][:start] + written + match[0][stop:]
+
+    return REFERENCES.sub(replaced, model)
 
 
 #: A tetrahedron.
@@ -177,25 +175,16 @@ _STAND_IN = obj_text(
 )
 
 
-def _parse(plant: MultibodyPlant, path: Path) -> tuple[Any, list[str]]:
-    """Let Drake parse a model file; return its model instance, and notes of what it left out."""
-    parser, logger, messages = make_parser(plant), logging.getLogger("drake"), list[str]()
-
-    def hear(record: logging.LogRecord) -> bool:
-        if record.levelno == logging.WARNING:
-            messages.append(record.getMessage())
-        return record.levelno > logging.WARNING
-
-    logger.addFilter(hear)
+def _parse(plant: MultibodyPlant, path: Path) -> ModelInstanceIndex:
+    """Let Drake parse a model file without its warnings; faults that count are found elsewhere."""
+    logger, level = logging.getLogger("drake"), logging.getLogger("drake").level
+    logger.setLevel(logging.ERROR)
     try:
-        (instance,) = parser.AddModels(path)
-    except (RuntimeError, ValueError, SystemExit) as error:
-        text = first_line(error).replace(f"{path.parent}/", "")
-        raise HandError(f"model: must be a file of one model, got {text}") from None
+        return add_model(plant, ModelFile(path))
+    except HandError as error:
+        raise HandError(str(error).replace(f"{path.parent}/", "")) from None
     finally:
-        logger.removeFilter(hear)
-    lines = (" ".join(m.split()).partition(" warning: ")[2] for m in messages)
-    return instance, [f"Drake: {t}" for t in dict.fromkeys(lines) if t and not _ASIDE.search(t)]
+        logger.setLevel(level)
 
 
 def _joint(joint: Any, effort: float) -> VendorJoint:

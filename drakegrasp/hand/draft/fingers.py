@@ -47,21 +47,15 @@ class Answers:
 
     Attributes:
         palm: The link from which the fingers branch.
-        approach: (3,), +Gz in the palm link, out of the palm.
         fingers: Fingertip links of all fingers that grasp.
         joints: Positions of joints that no finger closes [rad or m].
-        reverse: Closing joints that close in the other direction.
         effort: Largest effort of the motors [N m or N], if it is the same for all.
-        settings: Lines KEY=VALUE of the hand file.
     """
 
     palm: str | None = None
-    approach: Array | None = None
     fingers: tuple[str, ...] = ()
     joints: Mapping[str, float] = field(default_factory=dict)
-    reverse: tuple[str, ...] = ()
     effort: float | None = None
-    settings: tuple[str, ...] = ()
 
     def refuse_unknown(self, model: VendorModel) -> None:
         """Reject answers about joints that the model does not have.
@@ -69,12 +63,10 @@ class Answers:
         Raises:
             HandError: If there are any.
         """
-        for option, names in (("--joint", self.joints), ("--reverse", self.reverse)):
-            for name in names:
-                if name not in model.joints:
-                    joints = ", ".join(model.joints)
-                    raise HandError(f"{option} must name one of {joints}, got {name!r}")
         for name, position in self.joints.items():
+            if name not in model.joints:
+                joints = ", ".join(model.joints)
+                raise HandError(f"--joint must name one of {joints}, got {name!r}")
             lower, upper = model.joints[name].limits
             if not lower <= position <= upper:
                 raise HandError(f"--joint {name} must be {lower:g}..{upper:g}, got {position:g}")
@@ -212,9 +204,9 @@ def find_closings(
     choices = [_positions(model, leader, answers) for leader in kept]
     rests = tuple(positions[0] for positions in choices)
 
-    # Try both directions, unless a person specified the direction.
+    # Try both directions.
     found, lead = [], next(iter(bending.values()))[0][0]
-    for sign in (-1.0,) if joints[lead].name in answers.reverse else (1.0, -1.0):
+    for sign in (1.0, -1.0):
         senses = [sign * (1.0 if axes[m[0][0]] @ axes[lead] >= 0.0 else -1.0)
                   for m in bending.values()]  # fmt: skip
         bends = _bends(joints, list(bending.values()), senses)

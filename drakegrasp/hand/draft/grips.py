@@ -19,7 +19,7 @@ close as usual. `away` is how far other joints are from their rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +28,6 @@ from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.draft.fingers import STEPS, Closing
 from drakegrasp.hand.draft.vendor import VendorJoint, VendorModel
 from drakegrasp.hand.finger_sweep import even_points
-from drakegrasp.hand.overlaps import Overlap
 from drakegrasp.hand.shapes import ray_span
 
 #: A direction this close to an axis of the link is replaced by the axis [rad].
@@ -57,8 +56,6 @@ SQUARE = 0.3
 GRIPS = 40
 #: Maximum number of fingers that grasp; a hand with more fingers uses this many.
 FINGERS = 3
-#: Allowed overlap of links other than fingertips [m].
-SUNK = 5e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -342,28 +339,3 @@ def _grip(others: Sequence[Finger], last: Finger, cost: float) -> Grip:
         axis=(end - start) / np.linalg.norm(end - start),
         middle=(end + start) / 2.0,
     )
-
-
-def is_clear(
-    grip: Grip, postures: Iterable[Mapping[str, float]], overlaps: Callable[..., list[Overlap]]
-) -> bool:
-    """Return whether no links of two fingers overlap before two fingertips do.
-
-    Args:
-        grip: The grip.
-        postures: Positions of all joints, from the open hand of the grip to the closed one.
-        overlaps: Returns the overlaps of links at positions, see `hand.overlaps`.
-    """
-    owner = {joint.child: i for i, f in enumerate(grip.fingers) for joint in f.joints}
-    tips = {finger.tip for finger in grip.fingers}
-    for posture in postures:
-        met = [
-            (links, depth)
-            for links, depth in overlaps(posture)
-            if len({owner.get(link) for link in links} - {None}) == 2
-        ]
-        if any(tips.issuperset(links) for links, _ in met):
-            return True
-        if any(depth > SUNK for _, depth in met):
-            return False
-    return True

@@ -1,8 +1,7 @@
 """Drafts a hand file and its model from a grip and its palm frame.
 
 Input: a `VendorModel`, a `Grip` and a `PalmFrame`. Output: the model, in which a positive position
-of a closing joint closes the finger, from 0 in the open hand; and the keys of a hand file, with the
-reasons for their values.
+of a closing joint closes the finger, from 0 in the open hand; and the keys of a hand file.
 
 A fingertip presses as hard as its weakest motor allows. With the motion dp/dc of the pad point as
 the finger closes, u = dp/dc / |dp/dc|, and the lever arm l_m of motor m (the motion of the pad
@@ -16,19 +15,18 @@ stronger side is limited to the other: a motor cannot press harder than the oppo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Any
 
 import numpy as np
-import yaml
 
-from drakegrasp.config import Config, apply_override
-from drakegrasp.errors import ConfigError, HandError
+from drakegrasp.config import Config
+from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.hand.description import FINGER_DAMPING
-from drakegrasp.hand.draft.fingers import Answers, find_closings, find_palm, find_tips
+from drakegrasp.hand.draft.fingers import Answers
 from drakegrasp.hand.draft.grips import Finger, Grip
 from drakegrasp.hand.draft.palm import PalmFrame
 from drakegrasp.hand.draft.vendor import VendorModel
@@ -49,38 +47,6 @@ HOLDING = 2.0
 STANDOFFS, NEAREST = (0.45, 0.65, 0.8), 0.003
 #: Payload as a fraction of the mass that friction supports.
 PAYLOAD = 0.5
-#: Tested spreads if two joints spread fingers [deg], and the smallest range of such joints [rad].
-SPREADS_DEG, SPREADING = [0.0, 11.25, 22.5], 0.9
-#: Cosine of the largest angle between Gz and the axis of a joint that spreads a finger.
-UPRIGHT = 0.98
-#: Names of fingers, found in the names of their links and joints.
-NAMES = (("thumb", "index", "middle", "ring", "pinky", "little"), ("left", "right"))
-#: Reasons for values, by the paths of their keys.
-_EFFORT = "the motor's effort, reduced where one side would press harder than the other"
-REASONS = {
-    "palm.link": "the link from which the fingers branch",
-    "palm.p_BG": "on the palm's surface, where a line to the pinch leaves it [m]",
-    "fingers": "counter-clockwise about Gz; the last one opposes the others",
-    "fingers.fingertip": "the last link with shapes",
-    "fingers.closing_joint": "the first that bends the finger; it closes from 0 on, see the head "
-    "of the model",
-    "fingers.torque_limit": _EFFORT,
-    "fingers.force_limit": _EFFORT,
-    "fingers.holding_torque": "guessed: twice that",
-    "fingers.holding_force": "guessed: twice that",
-    "fingers.driven_by": "in the model one motor moves both; its limit is that of both",
-    "fingers.coupled": "as in the model, or else guessed: the joints behind it bend along",
-    "fingers.pad_region": "the side that faces the closing motion, near the end",
-    "fingers.pad_point": "on that side [m]",
-    "spread.joints": "they turn two fingers about Gz, both by the same angle",
-    "spreads_deg": "usual ones",
-    "preshape": "where the fingers oppose best, and others out of the way",
-    "drive": "guessed: most gears cannot be pushed open; else `torque`",
-    "closing_speed_deg": "usual, or what the motors need",
-    "closing_speed": "usual, or what the motors need [m/s]",
-    "standoffs": "fractions of the height of the pinch above the palm [m]",
-    "payload": "half of the mass that friction supports at these efforts [kg]",
-}
 #: By index of a finger: the finger whose motor closes it, and its closing per that finger's.
 _Drivers = Mapping[int, tuple[int, float]]
 #: For each finger, the ratio and the offset of the joints that follow its closing joint, by name.
@@ -94,28 +60,12 @@ class Draft:
     Attributes:
         model: The model of the hand.
         tree: Keys and values of the hand file.
-        reasons: Reasons for values, by the paths of their keys, as in "palm.p_BG".
         changed: Lines that name the joints whose positions differ from the vendor's.
-        grip: The fingers that grasp; joint positions are those of the vendor's model.
     """
 
     model: VendorModel
     tree: dict[str, Any]
-    reasons: dict[str, str]
     changed: list[str]
-    grip: Grip
-
-    def text(self, head: Sequence[str]) -> str:
-        """Return the YAML of the hand file: comments `head`, then keys below their reasons."""
-        lines = [f"# {line}" for line in head]
-        dumped = yaml.safe_dump(self.tree, sort_keys=False, default_flow_style=None, width=100)
-        for line in dumped.splitlines():
-            if line[0] not in " -":
-                key = line.partition(":")[0]
-                whys = [(p, why) for p, why in self.reasons.items() if p.split(".")[0] == key]
-                lines += ["", *(f"# {path}: {why}" for path, why in whys)]
-            lines.append(line)
-        return "\n".join(lines) + "\n"
 
 
 def positions(model: VendorModel, grip: Grip, share: float) -> dict[str, float]:
@@ -141,7 +91,7 @@ def draft_file(
     """Return the hand file of a grip.
 
     Raises:
-        HandError: If no effort of the motors is known, or a setting is malformed.
+        HandError: If no effort of the motors is known.
     """
     grip = _in_order(grip, frame)
     limits, forces = _closing_limits(model, grip, answers.effort)
@@ -160,11 +110,8 @@ def draft_file(
 
     # Joints that are not driven keep a position.
     driven = {f.joint.name for f in grip.fingers} | {name for each in followers for name in each}
-    spread = _spread(grip, frame, driven)
-    if spread:
-        tree |= {"spread": {"joints": list(spread)}, "spreads_deg": SPREADS_DEG}
     opened = positions(model, grip, 0.0)
-    if kept := {n: round(q, 5) for n, q in opened.items() if n not in driven | set(spread)}:
+    if kept := {name: round(q, 5) for name, q in opened.items() if name not in driven}:
         tree["preshape"] = kept
 
     # Drive, speeds, and the hand's use.
@@ -175,38 +122,12 @@ def draft_file(
         "standoffs": [max(round(s * frame.height, 3), NEAREST) for s in STANDOFFS],
         "payload": float(f"{carried:.2g}"),
     }
-    reasons = _reasons(tree, frame, answers)
-    for setting in answers.settings:
-        try:
-            apply_override(tree, setting)
-        except ConfigError as error:
-            raise HandError(str(error)) from None
-        reasons[setting.partition("=")[0]] = "given"
     changed = [
         f"joint {f.joint.name}: position is {f.sign:+g} * (the vendor's - {f.zero:g})"
         for f in grip.fingers
         if f.sign != 1.0 or f.zero != 0.0
     ]
-    rebased = _rebased(model, grip, followers, drivers, spread)
-    return Draft(model=rebased, tree=tree, reasons=reasons, changed=changed, grip=grip)
-
-
-def _reasons(tree: dict[str, Any], frame: PalmFrame, answers: Answers) -> dict[str, str]:
-    """Return the reasons for the values that a hand file has, by the paths of their keys."""
-    named = {
-        f"{key}.{name}" for key in ("palm", "spread", "preshape") for name in tree.get(key, ())
-    }
-    named |= {f"fingers.{name}" for finger in tree["fingers"] for name in finger}
-    found = {path: why for path, why in REASONS.items() if path in named or path in tree}
-    found["palm.rpy_deg"] = (
-        f"Gz square to the closing line, pinch {1e3 * frame.height:.0f} mm ahead; Gy to the last "
-        "finger"
-    )
-    given = [f"preshape.{name}" for name in answers.joints]
-    given += ["palm.link"] * (answers.palm is not None)
-    given += ["palm.rpy_deg"] * (answers.approach is not None)
-    given += ["fingers.torque_limit", "fingers.force_limit"] * (answers.effort is not None)
-    return found | {path: f"given; {found.get(path, '')}" for path in given if path in named}
+    return Draft(model=_rebased(model, grip, followers, drivers), tree=tree, changed=changed)
 
 
 def _in_order(grip: Grip, frame: PalmFrame) -> Grip:
@@ -226,7 +147,7 @@ def _finger_keys(
     grip: Grip, limits: Array, drivers: _Drivers, followers: _Followers
 ) -> list[dict[str, Any]]:
     """Return the keys of the fingers, with the limits of their motors and what follows them."""
-    names, found = _finger_names(grip), []
+    names, found = [finger.tip for finger in grip.fingers], []
     for i, (finger, name, limit) in enumerate(zip(grip.fingers, names, limits, strict=True)):
         joint = finger.joint
         keys: dict[str, Any] = {"name": name, "fingertip": finger.tip, "closing_joint": joint.name}
@@ -245,19 +166,6 @@ def _finger_keys(
             keys | {"pad_region": finger.pad_region, "pad_point": finger.pad_point.tolist()}
         )
     return found
-
-
-def _finger_names(grip: Grip) -> list[str]:
-    """Return a name for each finger: a usual one or a side, or else that of its last link."""
-    for words in NAMES:
-        found = []
-        for finger in grip.fingers:
-            texts = [finger.tip, *(joint.name for joint in reversed(finger.joints))]
-            texts += [joint.child for joint in finger.joints]
-            found += [word for text in texts for word in words if word in text.lower()][:1]
-        if len(set(found)) == len(grip.fingers):
-            return found
-    return [finger.tip for finger in grip.fingers]
 
 
 def _followers(model: VendorModel, grip: Grip) -> list[dict[str, tuple[float, float]]]:
@@ -291,21 +199,6 @@ def _shared_motors(model: VendorModel, grip: Grip) -> dict[int, tuple[int, float
     return found
 
 
-def _spread(grip: Grip, frame: PalmFrame, driven: set[str]) -> dict[str, float]:
-    """Return the sign of each of two joints that spread fingers about Gz, or an empty mapping."""
-    found: dict[str, float] = {}
-    for finger in grip.fingers:
-        joint = finger.joints[0]
-        along = abs(float((joint.X_PJ[:3, :3] @ joint.axis) @ frame.X_BG[:3, 2]))
-        lower, upper = joint.limits
-        one_way = lower > -1e-6 if upper > SPREADING else upper < 1e-6 and lower < -SPREADING
-        if joint.slides or joint.name in driven or along < UPRIGHT or not one_way:
-            continue
-        if finger.closing.preshape.get(joint.name) == 0.0:
-            found[joint.name] = 1.0 if upper > SPREADING else -1.0
-    return found if len(found) == 2 else {}
-
-
 def _speeds(grip: Grip, limits: Array, config: Config) -> dict[str, float]:
     """Return the closing speeds: usual ones at which motors can reach their limits in time."""
     speeds: dict[str, float] = {}
@@ -326,9 +219,8 @@ def _rebased(
     grip: Grip,
     followers: _Followers,
     drivers: _Drivers,
-    spread: Mapping[str, float],
 ) -> VendorModel:
-    """Return the model in which closing joints close from 0, and spread joints open from 0."""
+    """Return the model in which closing joints close from 0."""
     joints, mimics = dict(model.joints), {}
     for finger, own in zip(grip.fingers, followers, strict=True):
         joint = finger.joint
@@ -339,8 +231,6 @@ def _rebased(
     for i, (driver, ratio) in drivers.items():
         name, leader = grip.fingers[i].joint.name, grip.fingers[driver].joint.name
         mimics[name] = Mimic(joint=name, leader=leader, ratio=ratio, offset=0.0)
-    for name, sign in spread.items():
-        joints[name] = joints[name].rebased(sign, 0.0)
     return replace(model, joints=joints, mimics=mimics)
 
 
@@ -407,13 +297,3 @@ def _levers(model: VendorModel, finger: Finger, step: int) -> tuple[float, dict[
             rate = rates.setdefault(leader, abs(float(gain)))
             motors[leader] = motors.get(leader, np.zeros(3)) + gain / rate * column
     return float(np.linalg.norm(motion)), {m: abs(float(v @ along)) for m, v in motors.items()}
-
-
-def unused_fingers(model: VendorModel, grip: Grip, answers: Answers) -> Iterator[str]:
-    """Yield a line for each finger that does not grasp, with the reason."""
-    palm, used = find_palm(model, answers), {finger.tip for finger in grip.fingers}
-    for tip in find_tips(model, palm, answers):
-        if tip not in used:
-            closes = find_closings(model, model.chain(tip, palm), answers)
-            why = "the others meet better: --fingers says which grasp"
-            yield f"finger {tip} is not used: {why if closes else 'none of its joints closes it'}"

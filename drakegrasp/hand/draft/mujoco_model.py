@@ -29,10 +29,6 @@ from drakegrasp.hand.parsing import Mimic
 
 #: Maximum size of a model's text [bytes].
 LONGEST = 20_000_000
-#: First group of shapes that MuJoCo does not draw unless it is asked to.
-HIDDEN = 3
-#: Colour of a shape whose model gives none: that of its material is drawn.
-_PLAIN = np.array([0.5, 0.5, 0.5, 1.0])
 
 
 def compile_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
@@ -166,19 +162,19 @@ def _link(mujoco: Any, model: Any, b: int, name: str, notes: list[str]) -> Link:
         central = RotationalInertia(*model.body_inertia[b]).ReExpress(R_BI)
         inertia = SpatialInertia.MakeFromCentralInertia(mass, model.body_ipos[b], central)
 
-    # Shapes collide, are drawn, or both.
-    collisions, visuals = [], []
+    # Shapes that collide, or else those that are drawn.
+    collisions, pictures = list[Shape](), list[Shape]()
     for g in np.flatnonzero(model.geom_bodyid == b).tolist():
-        shape, rgba = _shape(mujoco, model, g), _colour(model, g)
+        shape = _shape(mujoco, model, g)
         if shape is None:
             kind = mujoco.mjtGeom(int(model.geom_type[g])).name.removeprefix("mjGEOM_").lower()
             notes.append(f"link {name}: a shape of type {kind} is not kept")
-            continue
-        if model.geom_contype[g] or model.geom_conaffinity[g]:
+        elif model.geom_contype[g] or model.geom_conaffinity[g]:
             collisions.append(shape)
-        if model.geom_group[g] < HIDDEN and rgba[3] > 0.0:
-            visuals.append(replace(shape, colour=rgba[:3]))
-    return Link(name=name, inertia=inertia, collisions=tuple(collisions), visuals=tuple(visuals))
+        else:
+            pictures.append(shape)
+    drawn = () if collisions else tuple(pictures)
+    return Link(name=name, inertia=inertia, collisions=tuple(collisions), pictures=drawn)
 
 
 def _shape(mujoco: Any, model: Any, g: int) -> Shape | None:
@@ -204,14 +200,6 @@ def _shape(mujoco: Any, model: Any, g: int) -> Shape | None:
     vertices = model.mesh_vert[start : start + model.mesh_vertnum[m]].astype(float)
     faces = model.mesh_face[face : face + model.mesh_facenum[m]].astype(np.int64)
     return Shape(X_LS=X_BS, vertices=vertices, faces=faces)
-
-
-def _colour(model: Any, g: int) -> Array:
-    """Return the colour (4,) with which MuJoCo draws a shape."""
-    own, material = np.asarray(model.geom_rgba[g], dtype=float), int(model.geom_matid[g])
-    if material >= 0 and np.array_equal(own, _PLAIN):
-        return np.asarray(model.mat_rgba[material], dtype=float)
-    return own
 
 
 def _mimics(mujoco: Any, model: Any, joints: Sequence[str], notes: list[str]) -> Iterator[Mimic]:

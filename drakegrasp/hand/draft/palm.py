@@ -60,7 +60,6 @@ def find_palm_frames(
     palm: str,
     grip: Grip,
     postures: Sequence[Mapping[str, float]],
-    approach: Array | None,
 ) -> list[PalmFrame]:
     """Return the palm frames of a grip, the best first; empty if the palm faces no pinch.
 
@@ -69,7 +68,6 @@ def find_palm_frames(
         palm: Link B.
         grip: The fingers.
         postures: Positions of all joints, from the open to the closed hand.
-        approach: (3,), +Gz in B; None if unknown.
     """
 
     # The corners of each shape in B, in a posture.
@@ -86,7 +84,7 @@ def find_palm_frames(
     parts = [shape.corners() for shape in model.links[palm].collisions] or opened
     frames = []
     centre = np.concatenate(parts).mean(axis=0)
-    for direction, aside in _directions(grip, centre, approach):
+    for direction, aside in _directions(grip, centre):
         found = _origin(grip, direction, parts)
         if found is None:
             continue
@@ -112,10 +110,8 @@ def find_palm_frames(
     return sorted(frames, key=lambda frame: frame.rank)
 
 
-def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple[Array, float]]:
+def _directions(grip: Grip, centre: Array) -> list[tuple[Array, float]]:
     """Return possible unit directions (3,) of Gz, with angles to the line palm-pinch [rad]."""
-    if approach is not None:
-        return [(approach / np.linalg.norm(approach), 0.0)]
     axis = grip.axis
     line = grip.middle - centre
     line = line - (line @ axis) * axis

@@ -1,18 +1,16 @@
 """Shapes of a vendor's links: primitives of Drake, and meshes of many formats.
 
 Input: mesh files, and shapes that Drake parsed. Output: `Shape`s on the links. A shape that is not
-a primitive becomes triangles, few enough to be drawn quickly. A collision shape becomes a convex
-hull.
+a primitive becomes triangles, and in the draft a convex hull.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import fast_simplification
 import numpy as np
 import numpy.typing as npt
 import trimesh
@@ -24,7 +22,6 @@ from pydrake.geometry import (
     Ellipsoid,
     GeometryId,
     Mesh,
-    Role,
     SceneGraphInspector,
     Sphere,
 )
@@ -34,13 +31,9 @@ from drakegrasp.arithmetic import dot
 from drakegrasp.errors import HandError, MeshError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.shapes import ball_corners, hull_corners, primitive_corners
-from drakegrasp.mesh.loading import join_scene, load_scene
+from drakegrasp.mesh.loading import load_surface
 from drakegrasp.mesh.surfaces import Faces
 
-#: Number of faces to which larger meshes are simplified.
-MOST_FACES = 8_000
-#: Lower bound of colours, because the details of a black hand are invisible in a picture.
-DARKEST = 0.15
 #: Number of corners of the hull of a collision mesh; on a ball of 10 mm radius they miss less than
 #: 0.4 mm.
 CORNERS = 64
@@ -59,14 +52,12 @@ class Shape:
         primitive: A box, cylinder, capsule or sphere.
         vertices: (n, 3), vertices of a mesh, in its own frame [m].
         faces: (m, 3), faces of a mesh.
-        colour: (3,), if the model or the mesh file gives one.
     """
 
     X_LS: Array = field(default_factory=lambda: np.eye(4))
     primitive: Box | Cylinder | Capsule | Sphere | None = None
     vertices: Array | None = None
     faces: Faces | None = None
-    colour: Array | None = None
 
     def corners(self) -> Array:
         """Return points (n, 3) with the same hull as the shape, in the link's frame [m]."""
@@ -88,15 +79,6 @@ class Shape:
         farthest = np.unique([int(np.argmax(dot(points, d))) for d in directions])
         return _with_hull(self, points[farthest])
 
-    def simplified(self) -> Shape:
-        """Return a mesh with at most `MOST_FACES` faces, to be drawn; other shapes unchanged."""
-        if self.vertices is None or self.faces is None or len(self.faces) <= MOST_FACES:
-            return self
-        vertices, faces = fast_simplification.simplify(
-            self.vertices.astype(np.float32), self.faces.astype(np.int32), target_count=MOST_FACES
-        )
-        return replace(self, vertices=vertices.astype(float), faces=faces.astype(np.int64))
-
 
 def _with_hull(shape: Shape, points: Array) -> Shape:
     """Return a shape whose mesh is the convex hull of points (n, 3)."""
@@ -105,46 +87,29 @@ def _with_hull(shape: Shape, points: Array) -> Shape:
 
 
 def read_shape(
-    inspector: SceneGraphInspector,
-    geometry: GeometryId,
-    role: Role,
-    meshes: Mapping[str, Shape | HandError],
-    notes: list[str],
+    inspector: SceneGraphInspector, geometry: GeometryId, find_mesh: Callable[[str], Shape]
 ) -> Shape | None:
-    """Return a shape that Drake parsed, on its body; None if it has no bounds or is not drawn.
+    """Return a shape that Drake parsed, on its body; None if it has no bounds.
 
     Args:
         inspector: The inspector of the scene graph.
         geometry: The shape.
-        role: Whether the shape is drawn or collides.
-        meshes: Contents of the mesh files, or why they cannot be read, by the names that Drake has.
-        notes: Receives why a shape is not drawn; the collision shapes are drawn in its place.
+        find_mesh: Returns the content of the mesh file that Drake knows by a name.
 
     Raises:
-        HandError: If the mesh of a collision shape cannot be read.
+        HandError: If its mesh cannot be read.
     """
-    # Read its kind, and the colour that the model gives it.
-    shape, colour = inspector.GetShape(geometry), None
-    properties = inspector.GetProperties(geometry, role)
-    if properties is not None and properties.HasProperty("phong", "diffuse"):
-        rgba = properties.GetProperty("phong", "diffuse")
-        colour = np.array([rgba.r(), rgba.g(), rgba.b()])
-    found = Shape(X_LS=inspector.GetPoseInFrame(geometry).GetAsMatrix4(), colour=colour)
+    shape = inspector.GetShape(geometry)
+    found = Shape(X_LS=inspector.GetPoseInFrame(geometry).GetAsMatrix4())
     if isinstance(shape, Box | Cylinder | Capsule | Sphere):
         return replace(found, primitive=shape)
 
     # Other shapes become triangles: those of the file, or of the hull.
     if isinstance(shape, Mesh | Convex) and shape.source().is_path():
-        mesh = meshes[shape.source().path().name]
-        if isinstance(mesh, HandError):
-            if role == Role.kProximity:
-                raise mesh
-            notes.append(f"not drawn: {str(mesh).removeprefix('model: ')}")
-            return None
+        mesh = find_mesh(shape.source().path().name)
         assert mesh.vertices is not None
         vertices = mesh.vertices * np.asarray(shape.scale3())
-        colour = mesh.colour if colour is None else colour
-        return replace(found, vertices=vertices, faces=mesh.faces, colour=colour)
+        return replace(found, vertices=vertices, faces=mesh.faces)
     if isinstance(shape, Ellipsoid):
         return replace(found, **ellipsoid([shape.a(), shape.b(), shape.c()]))
     corners = hull_corners(inspector, geometry)
@@ -191,21 +156,7 @@ def read_mesh(path: Path) -> Shape:
         HandError: If the file is missing or not a mesh, see `drakegrasp.mesh.loading`.
     """
     try:
-        scene = load_scene(path)
+        vertices, faces = load_surface(path)
     except MeshError as error:
         raise HandError(f"model: mesh {error}") from None
-    # Seams of textures and shading would become gaps when faces are removed.
-    mesh = trimesh.Trimesh(*join_scene(scene), process=False)
-    mesh.merge_vertices()
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    return Shape(vertices=vertices, faces=faces, colour=_colour(scene))
-
-
-def _colour(scene: Any) -> Array | None:
-    """Return the colour (3,) of the largest mesh of a scene; None if no mesh has a colour."""
-    found: list[tuple[float, Array]] = []
-    for mesh in scene.geometry.values():
-        colour = getattr(getattr(mesh.visual, "material", None), "main_color", None)
-        if colour is not None:
-            found.append((float(mesh.area), np.asarray(colour, dtype=float)[:3] / 255.0))
-    return np.maximum(max(found, key=lambda pair: pair[0])[1], DARKEST) if found else None
+    return Shape(vertices=vertices, faces=faces)

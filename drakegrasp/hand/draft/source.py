@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import unquote
+from xml.etree import ElementTree
 
 from drakegrasp.errors import HandError
 from drakegrasp.hand.draft.drake_model import parse_model
 from drakegrasp.hand.draft.mujoco_model import compile_model
 from drakegrasp.hand.draft.vendor import VendorModel, weld
-from drakegrasp.hand.files import find_packages
 
 #: The reader of each format.
 READERS = {".urdf": parse_model, ".sdf": parse_model, ".xml": compile_model, ".mjcf": compile_model}
@@ -38,8 +38,22 @@ def read_model(path: Path, packages: Mapping[str, Path] | None = None) -> Vendor
     for name, folder in packages.items():
         if not folder.is_dir():
             raise HandError(f"package {name} must be a folder, got {str(folder)!r}")
-    known = {**find_packages(path.resolve().parent, path.name, {}), **packages}
+    known = {**_packages_above(path), **packages}
     return weld(READERS[suffix](path, lambda uri, base: _file_of(uri, base, path, known)))
+
+
+def _packages_above(path: Path) -> dict[str, Path]:
+    """Return the folders above a model that have a `package.xml`, by the name in that file."""
+    found: dict[str, Path] = {}
+    for above in path.resolve().parents:
+        manifest = above / "package.xml"
+        if manifest.is_file():
+            try:
+                name = ElementTree.parse(manifest).findtext("name")
+            except ElementTree.ParseError:
+                name = None
+            found.setdefault((name or above.name).strip(), above)
+    return found
 
 
 def _file_of(uri: str, base: Path, model: Path, packages: Mapping[str, Path]) -> Path:

@@ -3,15 +3,21 @@
 Input: bodies and joints as `drake_model` or `mujoco_model` reads them. Output of `weld`: a
 `VendorModel` in which bodies that are fixed to each other are one link, every link has a mass and
 an inertia that a body can have, and each follower names the joint that leads it. The frame of a
-link is the frame of the joint that carries it.
+link is the frame of the joint that carries it. `write_urdf` writes such a model, with its meshes as
+Wavefront files beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations_with_replacement
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from pydrake.geometry import Box, Capsule, Cylinder, Sphere
 from pydrake.math import RotationMatrix
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
@@ -19,6 +25,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, rotation_about, transform_points
 from drakegrasp.hand.draft.shapes import Shape, added, solid_inertia
 from drakegrasp.hand.parsing import Mimic, refuse_limits
+from drakegrasp.mesh.wavefront import obj_text
 
 #: Limits of a joint that has none.
 ENDLESS = np.array([-np.inf, np.inf])
@@ -26,11 +33,12 @@ ENDLESS = np.array([-np.inf, np.inf])
 ROOM = 0.5
 #: Smallest and largest size of a hand, including an arm [m]; other sizes mean other units.
 SIZES = (0.03, 3.0)
-#: Smallest and largest limit of joints that turn [rad], and range of masses of a hand, including an
-#: arm [kg]; other values mean other units.
-SMALLEST_TURN, LARGEST_TURN, MASSES = 0.1, 2.0 * np.pi, (0.01, 60.0)
 #: Mass [kg] and radius [m] of a moving link that has neither mass nor shape.
 BARE_MASS, BARE_RADIUS = 1e-3, 0.016
+#: Folder of the meshes.
+MESHES = "meshes"
+#: Velocity limit of a joint that has none [rad/s or m/s].
+FAST = 10.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,14 +49,14 @@ class Link:
         name: Name of the link.
         inertia: M_LLo_L; zero for a body whose model gives none, before it is welded.
         collisions: Collision shapes; convex after welding.
-        visuals: Shapes that are drawn.
+        pictures: Shapes that are drawn, of a body that has no others; empty after welding.
         impossible: What is wrong with the inertia of its model; empty if nothing is.
     """
 
     name: str
     inertia: SpatialInertia
     collisions: tuple[Shape, ...] = ()
-    visuals: tuple[Shape, ...] = ()
+    pictures: tuple[Shape, ...] = ()
     impossible: str = ""
 
     def corners(self) -> Array:
@@ -56,9 +64,9 @@ class Link:
         return np.concatenate([np.zeros((0, 3)), *[s.corners() for s in self.collisions]])
 
     @property
-    def weight(self) -> tuple[float, int, int]:
+    def weight(self) -> tuple[float, int]:
         """Rank of the link among those welded to it: the highest gives its name to all."""
-        return self.inertia.get_mass(), len(self.collisions), len(self.visuals)
+        return self.inertia.get_mass(), len(self.collisions)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -275,13 +283,13 @@ def _weld(members: Sequence[tuple[Link, Array]]) -> tuple[Link, list[str]]:
     """Return the link of bodies with poses (4, 4) in its frame, and notes of what was added."""
     # Join the shapes; without collision shapes, the visual shapes also collide.
     name, notes = max((body for body, _ in members), key=lambda body: body.weight).name, []
-    solids, visuals = (
+    solids, pictures = (
         [replace(s, X_LS=X_LB @ s.X_LS) for body, X_LB in members for s in getattr(body, kind)]
-        for kind in ("collisions", "visuals")
+        for kind in ("collisions", "pictures")
     )
-    if visuals and not solids:
+    if pictures and not solids:
         notes.append(f"link {name}: the model has no collision shapes; hulls of its pictures")
-    collisions = [shape.hull() for shape in solids or visuals]
+    collisions = [shape.hull() for shape in solids or pictures]
 
     # Add the inertias about the link's origin.
     total = SpatialInertia.Zero()
@@ -303,8 +311,7 @@ def _weld(members: Sequence[tuple[Link, Array]]) -> tuple[Link, list[str]]:
         )
         likely = solid_inertia(collisions) if collisions else ball
         total = SpatialInertia(total.get_mass(), likely.get_com(), likely.get_unit_inertia())
-    drawn = tuple(shape.simplified() for shape in visuals)
-    return Link(name=name, inertia=total, collisions=tuple(collisions), visuals=drawn), notes
+    return Link(name=name, inertia=total, collisions=tuple(collisions)), notes
 
 
 def _leaders(given: Mapping[str, Mimic], joints: Mapping[str, VendorJoint]) -> dict[str, Mimic]:
@@ -346,25 +353,6 @@ def _leaders(given: Mapping[str, Mimic], joints: Mapping[str, VendorJoint]) -> d
     return found
 
 
-def doubtful_units(model: VendorModel) -> Iterator[str]:
-    """Yield doubts about a model whose angles or masses no hand has: its units may be others."""
-    turning = [joint.limits for joint in model.joints.values() if not joint.slides]
-    angles = np.abs([limits for limits in turning if np.isfinite(limits).all()])
-    if angles.size and np.median(angles.max(axis=1)) > LARGEST_TURN:
-        yield (
-            f"its joints turn up to {angles.max():.4g} rad: are its limits in degrees? They must "
-            "be in radians"
-        )
-    if angles.size and angles.max() < SMALLEST_TURN:
-        yield (
-            f"its joints turn up to {np.rad2deg(angles.max()):.2g} degrees: are its angles in "
-            'radians? MJCF says so by <compiler angle="radian"/>'
-        )
-    mass = sum(link.inertia.get_mass() for link in model.links.values())
-    if not MASSES[0] <= mass <= MASSES[1]:
-        yield f"its masses are {mass:.3g} kg in all: are they in another unit? They must be in kg"
-
-
 def _refuse_size(model: VendorModel) -> None:
     """Reject a model without shapes, or a model whose units are not metres."""
     points = [transform_points(model.pose(n, {}), own.corners()) for n, own in model.links.items()]
@@ -377,3 +365,98 @@ def _refuse_size(model: VendorModel) -> None:
             f"model: must be a hand in metres, got one of {size:.3g} m: check units and scales of "
             "its meshes"
         )
+
+
+def write_urdf(model: VendorModel, path: Path, comments: Sequence[str]) -> None:
+    """Write a model.
+
+    Args:
+        model: The model.
+        path: The URDF file; meshes are written to a folder beside it.
+        comments: Lines for the beginning of the file.
+    """
+    robot = Element("robot", {"name": model.name, "xmlns:drake": "https://drake.mit.edu"})
+    for line in comments:
+        robot.append(ElementTree.Comment(f" {line.replace('--', '- -')} "))
+    (path.parent / MESHES).mkdir(parents=True, exist_ok=True)
+    for number, link in enumerate(model.links.values()):
+        name = "".join(c if c.isalnum() else "_" for c in link.name)
+        _add_link(robot, link, f"{number:02d}_{name}", path.parent)
+    for joint in model.joints.values():
+        _add_joint(robot, joint, model.mimics.get(joint.name))
+    ElementTree.indent(robot)
+    text = ElementTree.tostring(robot, encoding="unicode")
+    path.write_text(f'<?xml version="1.0"?>\n{text}\n', encoding="utf-8")
+
+
+def _add(parent: Element, tag: str, **given: str | float | Array) -> Element:
+    """Add an element with its attributes: texts, numbers, or arrays of numbers."""
+    return SubElement(parent, tag, {
+        key: value if isinstance(value, str) else " ".join(
+            f"{float(number) + 0.0:.10g}" for number in np.ravel(value))
+        for key, value in given.items()
+    })  # fmt: skip
+
+
+def _add_origin(parent: Element, X: Array) -> None:
+    rpy = RotationMatrix.ProjectToRotationMatrix(X[:3, :3]).ToRollPitchYaw().vector()
+    _add(parent, "origin", xyz=X[:3, 3], rpy=rpy)
+
+
+def _add_link(robot: Element, link: Link, stem: str, folder: Path) -> None:
+    """Add a link; its meshes become files whose names start with `stem`."""
+    # Inertia about the centre of mass.
+    element = _add(robot, "link", name=link.name)
+    inertial, p_LLcm = _add(element, "inertial"), link.inertia.get_com()
+    tensor = link.inertia.Shift(p_LLcm).CalcRotationalInertia().CopyToFullMatrix3()
+    _add(inertial, "origin", xyz=p_LLcm)
+    _add(inertial, "mass", value=link.inertia.get_mass())
+    pairs = combinations_with_replacement(range(3), 2)
+    _add(inertial, "inertia", **{f"i{'xyz'[a]}{'xyz'[b]}": tensor[a, b] for a, b in pairs})
+
+    # Shapes, which are drawn as they collide; meshes are separate files.
+    for n, shape in enumerate(link.collisions):
+        name = f"{stem}_{n}"
+        if shape.vertices is not None and shape.faces is not None:
+            text = obj_text(shape.vertices, shape.faces, normals=True)
+            (folder / MESHES / f"{name}.obj").write_text(text, encoding="utf-8")
+        for tag in ("collision", "visual"):
+            mesh = _add_shape(element, tag, shape, name)
+            if tag == "collision" and mesh is not None:
+                _add(mesh, "drake:declare_convex")
+
+
+def _add_shape(parent: Element, tag: str, shape: Shape, name: str) -> Element | None:
+    """Add a shape; return the element of a mesh."""
+    element = _add(parent, tag, name=name)
+    _add_origin(element, shape.X_LS)
+    geometry, own = _add(element, "geometry"), shape.primitive
+    if isinstance(own, Box):
+        _add(geometry, "box", size=own.size())
+    elif isinstance(own, Sphere):
+        _add(geometry, "sphere", radius=own.radius())
+    elif isinstance(own, Cylinder | Capsule):
+        kind = "cylinder" if isinstance(own, Cylinder) else "drake:capsule"
+        _add(geometry, kind, radius=own.radius(), length=own.length())
+    else:
+        return _add(geometry, "mesh", filename=f"{MESHES}/{name}.obj")
+    return None
+
+
+def _add_joint(robot: Element, joint: VendorJoint, mimic: Mimic | None) -> None:
+    """Add a joint, with the joint that it follows."""
+    limited = bool(np.isfinite(joint.limits).all())
+    turns = "revolute" if limited else "continuous"
+    element = _add(robot, "joint", name=joint.name, type="prismatic" if joint.slides else turns)
+    _add(element, "parent", link=joint.parent)
+    _add(element, "child", link=joint.child)
+    _add_origin(element, joint.X_PJ)
+    _add(element, "axis", xyz=joint.axis)
+
+    # Limits, and the leader.
+    ends = dict(zip(("lower", "upper"), joint.limits, strict=True)) if limited else {}
+    speed = joint.velocity if np.isfinite(joint.velocity) else FAST
+    _add(element, "limit", **ends, effort=joint.effort, velocity=speed)
+    if mimic is not None:
+        line = {"multiplier": mimic.ratio, "offset": mimic.offset}
+        _add(element, "mimic", joint=mimic.leader, **line)

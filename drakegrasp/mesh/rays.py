@@ -1,6 +1,6 @@
-"""Crossings: where rays first meet a surface of triangles, and which faces cross others.
+"""Rays: where they first meet a surface of triangles.
 
-The results have the same bits on every machine, since only sums, products and roots are used.
+The result has the same bits on every machine, since only sums, products and roots are used.
 Embree cannot replace this module: it computes in single precision, with kernels that depend on the
 CPU.
 """
@@ -12,9 +12,6 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import dot, norm, sin_cos
 from drakegrasp.frames import Array
-from drakegrasp.mesh.surfaces import Faces, diagonal, pair_blocks, unit_normals
-
-# Rays
 
 #: A ray that misses a triangle by this fraction of its size still meets it, so that no ray passes
 #: between two triangles.
@@ -103,78 +100,3 @@ def seen_points(
     found = first_hits(triangles, np.tile(eye, (len(rays), 1)), rays)
     hit = np.isfinite(found)
     return np.asarray(eye + found[hit, None] * rays[hit])
-
-
-# Faces that cross
-
-#: An edge passes through a face if its ends are farther than this from the face's plane, on
-#: opposite sides, and the edge is farther than this from the face's edges, as a fraction of the
-#: diagonal. Surfaces that only touch do not cross, even if their vertices are rounded.
-DEPTH = 2e-6
-#: Number of pairs of faces that are tested together.
-FACE_PAIRS = 1_000_000
-
-Mask = npt.NDArray[np.bool_]
-
-
-def crossing_faces(vertices: Array, faces: Faces) -> Faces:
-    """Return the faces (k,) that pass through another face, in their order.
-
-    Faces with a common edge do not count, since they cannot cross unless they are folded flat. An
-    edge that passes exactly through another face's edge is not found, but a neighbouring one is.
-    The result has the same bits on every machine, since only sums, products and roots are used.
-
-    Args:
-        vertices: (n, 3) [m].
-        faces: (m, 3).
-    """
-    # Sweep along the longest axis: faces whose boxes overlap along it are consecutive.
-    low, high = vertices[faces].min(axis=1), vertices[faces].max(axis=1)
-    axis = int(np.argmax(np.ptp(vertices, axis=0)))
-    order = np.argsort(low[:, axis], kind="stable")
-    ends = np.searchsorted(low[order, axis], high[order, axis], side="right")
-    counts = ends - np.arange(len(faces)) - 1
-
-    # Test the pairs of many faces at a time.
-    crosses = np.zeros(len(faces), dtype=bool)
-    depth = DEPTH * diagonal(vertices)
-    for i, j in pair_blocks(counts, FACE_PAIRS):
-        first, second = order[i], order[i + 1 + j]
-        overlap = ((low[first] <= high[second]) & (low[second] <= high[first])).all(axis=1)
-        first, second = first[overlap], second[overlap]
-        crossing = _cross(vertices, faces[first], faces[second], depth)
-        crosses[first[crossing]] = crosses[second[crossing]] = True
-    return np.flatnonzero(crosses)
-
-
-def _cross(vertices: Array, first: Faces, second: Faces, depth: float) -> Mask:
-    """Return which pairs (k,) of faces (k, 3) and (k, 3) pass through each other."""
-    crossing = np.zeros(len(first), dtype=bool)
-    shared = (first[:, :, None] == second[:, None, :]).any(axis=2)
-    # Only an edge that shares no vertex with the other face can pass through it.
-    apart = np.flatnonzero(shared.sum(axis=1) < 2)
-    for mine, other in ((first, second), (second, first)):
-        shared = (mine[:, :, None] == other[:, None, :]).any(axis=2)
-        for corner in range(3):
-            p, q = mine[:, corner], mine[:, (corner + 1) % 3]
-            free = apart[~(shared[apart, corner] | shared[apart, (corner + 1) % 3])]
-            hit = _pass(vertices[p[free]], vertices[q[free]], vertices[other[free]], depth)
-            crossing[free[hit]] = True
-    return crossing
-
-
-def _pass(p: Array, q: Array, triangles: Array, depth: float) -> Mask:
-    """Return which segments p (k, 3) to q (k, 3) pass through their triangle (k, 3, 3)."""
-    # The ends are on different sides of the triangle's plane ...
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    normal = unit_normals(triangles)
-    above, below = dot(p - a, normal), dot(q - a, normal)
-    sides = (np.minimum(above, below) < -depth) & (np.maximum(above, below) > depth)
-
-    # ... and the segment passes all three edges on the same side, with a distance.
-    along = q - p
-    passed = []
-    for u, v in ((a, b), (b, c), (c, a)):
-        lengths = np.maximum(norm(np.cross(along, v - u)), 1e-300)
-        passed.append(dot(along, np.cross(u - p, v - p)) / lengths)
-    return sides & ((np.min(passed, axis=0) > depth) | (np.max(passed, axis=0) < -depth))
