@@ -75,6 +75,7 @@ class Ranking:
         chance: (n,), chance that the grasp would be a sample of a dataset; 0 for a row that is not
             a posture. It was fitted for the Barrett Hand; for another hand it is an order only.
         share: (n,), share of the lifts that end as a sample; NaN if the grasp was not lifted.
+        height: Height of the highest point above the table [m].
         completion: What was lifted: "view", solids from which the free space of a view is cut,
             "cloud", solids without a view, or empty if nothing was lifted.
     """
@@ -84,6 +85,7 @@ class Ranking:
     features: Table
     chance: Array
     share: Array
+    height: float
     completion: str = ""
 
     @property
@@ -94,15 +96,13 @@ class Ranking:
     def explain(self) -> str:
         """Return in a sentence what to expect of the first grasp."""
         lifted = int(np.isfinite(self.share).sum())
-        how = (
-            f"{lifted} were lifted on the completed {self.completion}"
-            if lifted
-            else "none was lifted"
-        )
-        chance = f"{self.chance[self.order[0]]:.0%}"
+        where = f"on the object completed from the {self.completion}"
+        how = f"{lifted} lifted {where}" if lifted else "none was lifted"
+        chance = f"is a sample with a chance of {self.chance[self.order[0]]:.0%} ({how})"
         if self.likely:
-            return f"the first grasp is a sample with a chance of {chance}; {how}"
-        return f"no grasp is likely: the best one is a sample with a chance of {chance}; {how}"
+            return f"the first grasp {chance}"
+        high = f"the object is {1e3 * self.height:.0f} mm high"
+        return f"no grasp is likely: the best one {chance}; {high}"
 
 
 def rank(
@@ -173,6 +173,7 @@ def rank(
         features=Table(columns),
         chance=chance,
         share=share,
+        height=float(points[:, 2].max()),
         completion=completion,
     )
 

@@ -26,6 +26,8 @@ from drakegrasp.mesh.surfaces import Solid, from_manifold
 EDGE = 0.006
 #: Error that the simplified surface may have [m].
 TOLERANCE = 0.0008
+#: The depth of a pixel of the object also holds for pixels of unknown depth this close to it [px].
+AROUND = 2.0
 #: A point hides behind what is seen beside the object if it is farther away by this fraction.
 BEHIND = 0.02
 
@@ -94,14 +96,15 @@ def _in_free_space(p_TQ: Array, view: View) -> Array:
     in_image = (u >= 0.0) & (u <= width - 1) & (v >= 0.0) & (v <= height - 1)
     z, u, v = (np.where(in_image, each, 0.0) for each in (z, u, v))
 
-    # In front of the object, whose depth is continued around its pixels.
-    near = distance_transform_edt(~own, return_distances=False, return_indices=True)
+    # In front of the object, whose depth is continued to the pixels around it.
+    apart, near = distance_transform_edt(~own, return_indices=True)
+    row, column = np.rint(v).astype(int), np.rint(u).astype(int)
     ahead = map_coordinates(depth[tuple(near)], [v, u], order=1) - z
+    ahead = np.where(apart[row, column] <= AROUND, ahead, -np.inf)
 
     # Beside the object, in front of what is seen there; an unknown pixel shows nothing free.
     pixels = distance_transform_edt(beside) - distance_transform_edt(~beside)
     aside = map_coordinates(pixels - 0.5 * np.sign(pixels), [v, u], order=1) * z / K[0, 0]
-    row, column = np.rint(v).astype(int), np.rint(u).astype(int)
     hidden = beside[row, column] & (z > (1.0 + BEHIND) * depth[row, column])
     free = np.maximum(ahead, np.where(hidden, -np.inf, aside))
     return np.where(in_image, free, -np.inf)

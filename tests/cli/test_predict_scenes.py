@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from drakegrasp.scoring.network import load_network
 from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from PIL import Image
@@ -18,7 +19,6 @@ from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
-from drakegrasp.scoring.network import load_network
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.vision.depth_image import cloud_from_depth
 
