@@ -73,10 +73,9 @@ def complete(field: DistanceField, view: View | None = None) -> Solid:
     bounds = (*field.origin, *(field.origin + field.spacing * (np.array(values.shape) - 1)))
     inside = _interpolation(-values, field)
     whole = manifold3d.Manifold.level_set(inside, bounds, EDGE).trim_by_plane((0.0, 0.0, 1.0), 0.0)
-    parts = whole.decompose()
-    if not parts:
+    if whole.is_empty():
         raise TooLittleSeenError("cloud must show a solid, got one that the view shows to be free")
-    largest = max(parts, key=lambda part: float(part.volume()))
+    largest = max(whole.decompose(), key=lambda part: float(part.volume()))
     vertices, faces = from_manifold(largest.simplify(TOLERANCE))
     return Solid(vertices=vertices, faces=faces)
 
