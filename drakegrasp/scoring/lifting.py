@@ -39,7 +39,7 @@ SHIFTS, SLIPPERY = 0.004 * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]]), 0.63
 #: Logistic weights of the chance of a sample: a constant, for the score by closing, and for the
 #: share of lifts. They were fitted to lifts of the Barrett Hand on household meshes, see "Stated
 #: chances" in docs/results/choice.md.
-WITHOUT_LIFTS, WITH_LIFTS = (-5.3, 8.0), (-4.1, 4.2, 2.9)
+WITHOUT_LIFTS, WITH_LIFTS = (-5.6, 8.9), (-5.5, 5.7, 4.1)
 #: A grasp is likely from this chance on.
 LIKELY = 0.5
 
