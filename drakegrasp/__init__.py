@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
-    from drakegrasp.scoring.network import GraspNetwork, load_network
     from drakegrasp.scoring.proposals import propose
     from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
@@ -62,7 +61,6 @@ _HOMES = {
     "DrakegraspError": "errors",
     "GraspDataset": "dataset.reader",
     "GraspError": "errors",
-    "GraspNetwork": "scoring.network",
     "Hand": "hand.description",
     "HandError": "errors",
     "MachineError": "errors",
@@ -86,7 +84,6 @@ _HOMES = {
     "fit_table": "vision.depth_image",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
-    "load_network": "scoring.network",
     "make_benchmark": "api.building",
     "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",
@@ -112,7 +109,6 @@ __all__ = [
     "DrakegraspError",
     "GraspDataset",
     "GraspError",
-    "GraspNetwork",
     "Hand",
     "HandError",
     "MachineError",
@@ -136,7 +132,6 @@ __all__ = [
     "fit_table",
     "load_config",
     "load_hand",
-    "load_network",
     "make_benchmark",
     "make_posture",
     "pack_grasp",

@@ -236,7 +236,6 @@ def test_code_names_a_hand_only_as_a_default() -> None:
     assert sorted(named) == [
         ("config", "barrett"),
         ("hand.description", "barrett"),
-        ("scoring.network", "barrett-1"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""`predict` writes a network's grasps for views of scenes, or for what a camera saw."""
+"""`predict` writes grasps for views of scenes, or for what a camera saw, the best first."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import drakegrasp as dg
-from drakegrasp.cli.arguments import AnyPath, Count, File, Positive, Split, Units
+from drakegrasp.cli.arguments import AnyPath, Count, File, Positive, Settings, Split, Units
 from drakegrasp.cli.console import UsageError, processes, say, wrong_input
 from drakegrasp.errors import GraspError, MeshError
 
 if TYPE_CHECKING:
     from drakegrasp.arithmetic import Array
-    from drakegrasp.scoring.network import GraspNetwork
+    from drakegrasp.hand.description import Hand
     from drakegrasp.simulation.attempts import Attempts
+    from drakegrasp.vision.completion import View
 
 #: Suffixes of scenes, and of files of postures that are written.
 HDF5 = (".h5", ".hdf5")
@@ -28,6 +29,8 @@ KINDS = {
     "a cloud": ("units",),
     "a depth image": ("camera", "mask", "camera_pose", "depth_scale"),
 }
+#: Number of proposals that are lifted if it is not given.
+SIMULATED = 5
 
 
 def predict(
@@ -35,8 +38,9 @@ def predict(
     /,
     *,
     out: Annotated[AnyPath, Parameter(metavar="FILE")],
-    network: Annotated[str | None, Parameter(metavar="NAME|FILE")] = None,
+    simulate: Annotated[Count, Parameter(metavar="K", validator=Number(gte=0))] = SIMULATED,
     count: Positive | None = None,
+    overrides: Settings = (),
     split: Split | None = None,
     units: Units | None = None,
     camera: Annotated[str | None, Parameter(metavar="FX,FY,CX,CY|JSON")] = None,
@@ -48,12 +52,16 @@ def predict(
     workers: Count | None = None,
     quiet: bool = False,
 ) -> None:
-    """Write a network's grasps for what a camera saw, best first.
+    """Write grasps for what a camera saw, best first, with the chance that each is a sample.
 
     INPUT is the file scenes.hdf5 of a dataset, for all views of a split, in the rows of
     `drakegrasp score`; or a cloud of one object (.npy of shape (n, 3), or .ply), over a table that
     is z = 0, with +z up; or a depth image (.png of 16 bits, or .npy in metres) with a camera matrix
     and a mask of one object.
+
+    Grasps are proposed and ordered by closing the hand on the points. Then the first ones are
+    lifted in simulation on the object, completed from what was seen, until one holds in all its
+    lifts. The result also says if no grasp is likely to hold.
 
     The grasps are written as a file of postures with a confidence each. `drakegrasp score` and
     `build --postures` take those of scenes. Those of a cloud are in the frame of the cloud, and
@@ -62,8 +70,10 @@ def predict(
     Args:
         source: Scenes, a cloud or a depth image.
         out: HDF5 file (.h5) to write.
-        network: The network. [default: barrett-1]
+        simulate: Largest number of grasps of a view that are lifted; 0 for none.
         count: Maximum number of grasps of a view. [default: all that are proposed]
+        overrides: Change one setting of the preset fast, or for scenes of the dataset, e.g.
+            hand=allegro or objects.mass=0.3; may be given several times.
         split: Views of scenes. [default: test]
         units: Unit of length of a cloud. [default: m]
         camera: Camera matrix of a depth image in pixels: four numbers, or a file with K or with fx,
@@ -73,9 +83,13 @@ def predict(
             [default: from the plane on which the object stands]
         depth_scale: Unit of a .png depth image. [default: 0.001]
         workers: Number of processes for scenes. [default: one per core]
-        quiet: Show no progress.
+        quiet: Show neither progress nor what to expect.
     """
+    import numpy as np
+
     from drakegrasp.exchange.attempts import write_attempts
+    from drakegrasp.hand.description import load_hand
+    from drakegrasp.scoring.predicting import predict as predict_grasps
 
     # All input is checked before anything is predicted.
     _refuse_place(out, source)
@@ -89,24 +103,29 @@ def predict(
     options |= {"camera_pose": camera_pose, "depth_scale": depth_scale}
     kind = _kind_of(source, camera)
     _refuse_others(kind, options)
-    chosen = dg.load_network() if network is None else dg.load_network(network)
 
     # Scenes have many objects, the other kinds one.
     if kind == "scenes":
-        found = _of_scenes(chosen, source, split or "test", count, workers, show=not quiet)
-        write_attempts(out, found, chosen.hand, network=chosen.name)
+        found, hand = _of_scenes(
+            source, split or "test", simulate, count, overrides, workers, show=not quiet
+        )
+        write_attempts(out, found, hand)
         say(str(out))
         return
-    pose = None
+    config = dg.load_config("fast", list(overrides))
+    view, cloud = None, None
     if kind == "a cloud":
         cloud = _read_cloud(source, units or "m")
     else:
         assert camera is not None and mask is not None
         depth = _read_depth(source, depth_scale)
-        cloud, pose = _see(source, depth, camera, mask, camera_pose, show=not quiet)
-    found = chosen.predict(cloud, count=count)
-    write_attempts(out, _seen_from(found, pose), chosen.hand, network=chosen.name)
+        cloud, view = _see(source, depth, camera, mask, camera_pose, show=not quiet)
+    found, ranking = predict_grasps(cloud, view, config, simulate=simulate, count=count)
+    pose = None if view is None else np.asarray(view.X_TC)
+    write_attempts(out, _seen_from(found, pose), load_hand(config.hand_source))
     say(str(out))
+    if not quiet:
+        say(ranking.explain(), err=True)
 
 
 def _refuse_place(out: Path, source: Path) -> None:
@@ -166,26 +185,29 @@ def _refuse_others(kind: str, options: dict[str, Any]) -> None:
 
 
 def _of_scenes(
-    network: GraspNetwork,
     path: Path,
     split: str,
+    simulate: int,
     count: int | None,
+    overrides: tuple[str, ...],
     workers: int | None,
     *,
     show: bool,
-) -> Attempts:
-    """Return the grasps for the views of a split, and print how many there are."""
-    from drakegrasp.scoring.network import predict_scenes
+) -> tuple[Attempts, Hand]:
+    """Return the grasps for the views of a split and their hand; print how many there are."""
+    from drakegrasp.scoring.predicting import predict_scenes
 
     with processes(workers, "predict", "views", show=show) as how, wrong_input():
         how["report"] = how.pop("progress")
-        found, blind = predict_scenes(network, path, split=split, count=count, **how)
+        found, blind, hand = predict_scenes(
+            path, split=split, simulate=simulate, count=count, overrides=overrides, **how
+        )
     if show:
         views = len(set(found.of_row.tolist()))
         say(f"{len(found):,} grasps of {views:,} views", err=True)
     if blind:
         say(f"{blind:,} views show too little of their object: no grasp", err=True)
-    return found
+    return found, hand
 
 
 def _read_cloud(path: Path, units: str) -> Array:
@@ -232,8 +254,8 @@ def _read_depth(path: Path, scale: float | None) -> Array:
 
 def _see(
     path: Path, depth: Array, camera: str, mask: Path, camera_pose: Path | None, *, show: bool
-) -> tuple[Array, Array]:
-    """Return the object's points (n, 3) in {T} [m], and the camera's pose X_TC (4, 4).
+) -> tuple[Array, View]:
+    """Return the object's points (n, 3) in {T} [m], and the view that shows them.
 
     Raises:
         GraspError: If a file is invalid; the message names it.
@@ -242,6 +264,7 @@ def _see(
     from drakegrasp.exchange.columns import read_numbers
     from drakegrasp.frames import read_pose
     from drakegrasp.vision import depth_image as images
+    from drakegrasp.vision.completion import View
 
     K, own, off = images.read_camera(camera, depth.shape), images.read_mask(mask), ""
     if camera_pose is not None:
@@ -256,7 +279,8 @@ def _see(
         table = f"table: {share:.0%} of the pixels beside the object{off}"
         say(f"{table}; the camera is {1e3 * pose[2, 3]:.0f} mm above it", err=True)
     with named(path):
-        return images.cloud_from_depth(depth, K, own, pose), pose
+        cloud = images.cloud_from_depth(depth, K, own, pose)
+    return cloud, View(depth=depth, mask=own, K=images.read_lens(K), X_TC=pose)
 
 
 def _seen_from(found: Attempts, X_TC: Array | None) -> Attempts:

@@ -206,17 +206,16 @@ def read_arrays(path: Path, hand: Hand) -> dict[str, Any]:
     return _of_arrays(columns.read_arrays(path))
 
 
-def write_attempts(path: Path, table: Attempts, hand: Hand, *, network: str | None = None) -> None:
+def write_attempts(path: Path, table: Attempts, hand: Hand) -> None:
     """Write postures as an HDF5 file of arrays in our own layout, which `read_attempts` reads.
 
-    Attributes of the file state the hand, the network and the version of drakegrasp. `link` is not
-    written, since the poses are those of the palm frame.
+    Attributes of the file state the hand and the version of drakegrasp. `link` is not written,
+    since the poses are those of the palm frame.
 
     Args:
         path: The file; an older one is replaced.
         table: Postures with joints, in a frame whose poses do not need the mesh file.
         hand: The hand.
-        network: Name of the network that made them.
 
     Raises:
         GraspError: If a row is not a valid posture.
@@ -250,8 +249,7 @@ def write_attempts(path: Path, table: Attempts, hand: Hand, *, network: str | No
     # Columns without values are left out.
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file["frame"] = table.frame
-        told = {"hand": hand.name, "network": network, "drakegrasp": __version__}
-        file.attrs.update({name: value for name, value in told.items() if value is not None})
+        file.attrs.update({"hand": hand.name, "drakegrasp": __version__})
         for name, words in texts.items():
             if words is not None:
                 file[name] = np.array(words, dtype=h5py.string_dtype())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import dot, norm, sin_cos
+from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
 
 #: A ray that misses a triangle by this fraction of its size still meets it, so that no ray passes
@@ -71,32 +71,3 @@ def _triangle_hits(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
     # A triangle seen edge-on is skipped: the ray meets its neighbours.
     flat = np.abs(volume) <= EDGE * norm(ab) * norm(ac)
     return np.where(meets & ~flat, t, np.inf)
-
-
-def seen_points(
-    triangles: Array, azimuth: float, elevation: float, *, distance: float, half: float, pixels: int
-) -> Array:
-    """Return the points (n, 3) at which the rays of a camera's pixels first meet triangles.
-
-    The camera looks at the point on the axis z at half the height of the triangles.
-
-    Args:
-        triangles: Corners (m, 3, 3) [m], above z = 0.
-        azimuth: Direction of the camera from that point, about z [rad].
-        elevation: Direction of the camera above the horizontal [rad].
-        distance: Distance of the camera from that point [m].
-        half: Half the width of the square image at a distance of 1 m [m/m].
-        pixels: Number of pixels along an edge.
-    """
-    target = np.array([0.0, 0.0, triangles[..., 2].max() / 2.0])
-    sine, cosine = sin_cos([azimuth, elevation])
-    level = np.array([cosine[0], sine[0], 0.0])
-    back = cosine[1] * level + [0.0, 0.0, sine[1]]
-    right = np.array([level[1], -level[0], 0.0])
-    u, v = np.meshgrid(*[np.linspace(-half, half, pixels)] * 2)
-    rays = u.reshape(-1, 1) * right + v.reshape(-1, 1) * np.cross(-back, right) - back
-    rays /= norm(rays)[:, None]
-    eye = target + distance * back
-    found = first_hits(triangles, np.tile(eye, (len(rays), 1)), rays)
-    hit = np.isfinite(found)
-    return np.asarray(eye + found[hit, None] * rays[hit])

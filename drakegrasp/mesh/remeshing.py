@@ -219,6 +219,8 @@ def resting_hull(points: Array) -> Solid:
     """
     hull = trimesh.convex.convex_hull(points)
     vertices, faces = np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int64)
+    # trimesh merges vertices that nearly coincide, which leaves triangles without an area.
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     blocks, triangles, count = [vertices], list[Faces](), len(vertices)
     for facet in _facets(vertices, faces):
         border = _border(facet)

@@ -101,6 +101,10 @@ class ObjectModel:
             array.setflags(write=False)
             object.__setattr__(self, key, array)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields alone: the R-tree of a surface that was used is empty once pickled."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
     @property
     def half_extents(self) -> Array:
         """Half of the bounding box's edges (3,) [m]; its centre is the origin of {O}."""
@@ -240,17 +244,27 @@ def make_object(
     vertices, faces, reduced = coarsen(vertices, faces)
     solid = repair_solid(vertices, faces)
     _refuse_slight(solid)
+    notes = (*reduced, *solid.notes)
+    parts = count_parts(solid.vertices, solid.faces)
+    if parts > 1:
+        notes = (*notes, f"{parts} parts do not touch and will move as one")
+    solid = replace(solid, notes=notes)
+    return object_of(solid, config, name=name, class_name=class_name, mesh_sha256=mesh_sha256)
 
+
+def object_of(
+    solid: Solid, config: ObjectConfig, *, name: str, class_name: str, mesh_sha256: str
+) -> ObjectModel:
+    """Return the object of a sound solid; its `p_OM` is the origin of the solid's frame.
+
+    Raises:
+        MeshError: If no solid has such mass properties, or the surface cannot be decimated.
+    """
     # In {O}, whose origin is the centre of the bounding box.
     centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
     visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
     p_OOcm, I_OOcm_O = _mass_properties(visual, config.mass)
     collision, error = decimate(visual, config.max_collision_faces)
-
-    notes = (*reduced, *solid.notes)
-    parts = count_parts(solid.vertices, solid.faces)
-    if parts > 1:
-        notes = (*notes, f"{parts} parts do not touch and will move as one")
     return ObjectModel(
         name=name,
         class_name=class_name,
@@ -264,7 +278,7 @@ def make_object(
         p_OM=-centre,
         I_OOcm_O=I_OOcm_O,
         collision_error=error,
-        notes=notes,
+        notes=solid.notes,
     )
 
 

@@ -1,34 +1,43 @@
 """Ranking: the order in which to try grasps, by closing the hand on points that a camera saw.
 
 Input: grasps that anybody proposes, and an object's visible points in {T}, where the table is z =
-0. Output: a score of each. Nothing is simulated. The points become solids (`mesh.cloud`), and the
-hand's geometry determines where each finger stops (`simulation.closing`). A score is a mean over
-the solids and over small moves of the palm, or the chance that a learned `scoring.judge` computes
-from all of them. `scoring.proposals` proposes grasps.
+0. Output: a score of each. The points become solids (`mesh.cloud`), and the hand's geometry
+determines where each finger stops (`simulation.closing`). A score is a mean over the solids and
+over small moves of the palm. If the caller asks for it, the first grasps are also lifted in
+simulation on the completed object (`lifting`), which decides better than geometry.
+`scoring.proposals` proposes grasps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.config import Config
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import read_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
-from drakegrasp.scoring.judge import Judge, features_of, load_judge
+from drakegrasp.scoring.lifting import (
+    LIKELY,
+    chances,
+    lift_shares,
+    lifting_config,
+    place_completed,
+)
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.simulation.closing import close_on
 from drakegrasp.simulation.posture import start_of
 from drakegrasp.table import Table
+from drakegrasp.vision.completion import View
+from drakegrasp.vision.depth_image import cloud_from_depth
 
 #: Moves of the palm along its axes [m] over which a score is averaged; the first is no move.
 MOVES = 0.005 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
@@ -42,12 +51,13 @@ COLUMNS = ("clearance", "table", "touch", "gap", "push", "opposition", "arm", "r
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ranking:
-    """The scores of n proposals, and the features that determine them.
+    """The scores of n proposals, and what determines them.
 
     Attributes:
-        score: (n,), 0 to 1, greater is better: by the fixed weights only an order, with a judge
-            the chance that the grasp is a sample; -1 for a row that is not a posture.
-        order: (n,), indices of the proposals, best first; of equal ones the earlier is first.
+        score: (n,), 0 to 1, by closing, greater is better, an order only; -1 for a row that is not
+            a posture.
+        order: (n,), indices of the proposals, the largest chance first; of equal ones the earlier
+            is first.
         features: Columns, each a mean over solids and moves; NaN for a row that is not a posture:
             `clearance` (n,), distance of the open hand from the object [m], negative inside, at
             most 20 mm;
@@ -61,13 +71,38 @@ class Ranking:
             inward normal there;
             `opposition` (n,), how well the contacts' normals balance, 0 to 1;
             `arm` (n,), horizontal distance of the contacts' centre from the object's [m];
-            `robust` (n,), fraction in which the open hand is free and all required pads touch;
-            `held` (n,), only with a judge: the chance that the hand holds.
+            `robust` (n,), fraction in which the open hand is free and all required pads touch.
+        chance: (n,), chance that the grasp would be a sample of a dataset; 0 for a row that is not
+            a posture. It was fitted for the Barrett Hand; for another hand it is an order only.
+        share: (n,), share of the lifts that end as a sample; NaN if the grasp was not lifted.
+        height: Height of the highest point above the table [m].
+        completion: What was lifted: "view", solids from which the free space of a view is cut,
+            "cloud", solids without a view, or empty if nothing was lifted.
     """
 
     score: Array
     order: npt.NDArray[np.int64]
     features: Table
+    chance: Array
+    share: Array
+    height: float
+    completion: str = ""
+
+    @property
+    def likely(self) -> bool:
+        """Whether the first grasp of the order is likely to be a sample."""
+        return bool(self.chance[self.order[0]] >= LIKELY)
+
+    def explain(self) -> str:
+        """Return in a sentence what to expect of the first grasp."""
+        lifted = int(np.isfinite(self.share).sum())
+        where = f"on the object completed from the {self.completion}"
+        how = f"{lifted} lifted {where}" if lifted else "none was lifted"
+        chance = f"is a sample with a chance of {self.chance[self.order[0]]:.0%} ({how})"
+        if self.likely:
+            return f"the first grasp {chance}"
+        high = f"the object is {1e3 * self.height:.0f} mm high"
+        return f"no grasp is likely: the best one {chance}; {high}"
 
 
 def rank(
@@ -76,7 +111,9 @@ def rank(
     hand: Hand | str | None = None,
     *,
     spread: float = 0.0,
-    judge: Judge | str | Path | None = None,
+    simulate: int = 0,
+    view: View | Sequence[npt.ArrayLike] | None = None,
+    config: Config | None = None,
 ) -> Ranking:
     """Return the order in which to try proposals, by closing the hand on what a camera saw.
 
@@ -87,70 +124,85 @@ def rank(
         proposals: Postures of `propose` or `make_attempts`, in {T} or with their X_TO; or palm
             poses X_TG (n, 4, 4) or (4, 4), for which the hand starts open.
         cloud: (n, 3), points of the object only, in {T} [m]; the table is z = 0.
-        hand: A hand, or an argument of `load_hand`; None for the default hand.
+        hand: A hand, or an argument of `load_hand`; None for the hand of `config`, or else the
+            default hand.
         spread: Spread of palm poses [rad].
-        judge: Name or file of a judge of the hand, which then determines the scores; None for the
-            fixed weights, which any hand can use.
+        simulate: Largest number of proposals that are lifted on the completed object, in the order
+            of their scores, until all lifts of one are samples; 0 for none.
+        view: Depth image (h, w) [m], mask (h, w), camera matrix K (3, 3) [px] and camera pose X_TC
+            (4, 4) of the cloud, as in `cloud_from_depth`. They show what beside the object is
+            free.
+        config: Mass of the object, friction and all rules of the lifts; None for the preset `fast`.
 
     Raises:
-        GraspError: If the cloud, the poses or the spread are invalid, postures are in {O} without
-            X_TO or have other joints than the hand, or there is no such judge.
-        HandError: If the hand cannot be used, the judge is for another hand, or several of the
-            hand's fingers move one link.
+        GraspError: If the cloud, the poses, the spread or the view are invalid, postures are in {O}
+            without X_TO or have other joints than the hand, or `simulate` is negative.
+        HandError: If the hand cannot be used, or several of its fingers move one link.
+        ConfigError: If `config` is of another hand.
+        MeshError: If the completed object cannot be simulated.
     """
-    points, hand = read_cloud(cloud), chosen_hand(hand)
-    judge = None if judge is None else load_judge(judge)
-    if judge is not None:
-        judge.refuse_other_hand(hand)
-    columns = measured(proposals, points, hand, spread=spread)
-    score, known = columns["score"], ~np.isnan(columns["score"])
-    if judge is not None:
-        columns["held"], score = np.full((2, len(score)), np.nan)
-        if known.any():
-            columns["held"], score = judge.chances(columns).T
-    score = np.where(known, score, -1.0)
-    features = {name: columns[name] for name in (*COLUMNS, "held") if name in columns}
-    # The last bits of a score depend on the other rows, and must not decide.
-    order = np.argsort(-np.round(score, DECIMALS), kind="stable")
-    return Ranking(score=score, order=order, features=Table(features))
-
-
-def measured(
-    proposals: Attempts | npt.ArrayLike, points: Array, hand: Hand, *, spread: float = 0.0
-) -> dict[str, Array]:
-    """Return the score by fixed weights and all features (n, ...) of n proposals, by their names.
-
-    Among them are the features of a judge, see `judge.features_of`, unless no row is a posture. A
-    row that is not a posture is NaN.
-
-    Args:
-        proposals: See `rank`.
-        points: (p, 3), see `read_cloud`.
-        hand: The hand.
-        spread: See `rank`.
-    """
+    if simulate < 0:
+        raise GraspError(f"simulate must be a whole number, 0 or more, got {simulate}")
+    if view is not None:
+        if len(view) != len(View._fields):
+            raise GraspError(f"view must be {', '.join(View._fields)}, got {len(view)} values")
+        view = View(*view)
+        cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
+    points = read_cloud(cloud)
+    hand = load_hand(config.hand_source) if hand is None and config else chosen_hand(hand)
     proposals = _read_proposals(proposals, hand, spread)
     starts = _starts(proposals, hand, spread)
     solids = hull_solid(points), column_solid(points)
+    columns = measured(len(proposals), starts, solids, hand)
+    # The last bits of a score depend on the other rows, and must not decide.
+    score = np.round(columns.pop("score"), DECIMALS)
+    known = ~np.isnan(score)
+    score = np.where(known, score, -1.0)
+    order = np.argsort(-score, kind="stable")
 
+    # Lift the first ones.
+    share, completion = np.full(len(score), np.nan), ""
+    if tried := [i for i in order[:simulate].tolist() if known[i]]:
+        completed = place_completed(solids, view, lifting_config(hand, config))
+        share[tried] = lift_shares(completed, [starts[i] for i in tried])
+        completion = "cloud" if view is None else "view"
+    chance = np.where(known, chances(score, share), 0.0)
+    return Ranking(
+        score=score,
+        order=np.argsort(-chance, kind="stable"),
+        features=Table(columns),
+        chance=chance,
+        share=share,
+        height=float(points[:, 2].max()),
+        completion=completion,
+    )
+
+
+def measured(
+    count: int, starts: Mapping[int, Attempt], solids: Sequence[Solid], hand: Hand
+) -> dict[str, Array]:
+    """Return the score and the features (n, ...) of n proposals by their names.
+
+    Args:
+        count: Number of proposals, n.
+        starts: The start of each valid proposal by its index, in {T}; the others are NaN.
+        solids: What the points are filled to.
+        hand: The hand.
+    """
     # The paths of the fingers depend on preshape and spread.
     groups: dict[tuple[int | None, float], list[int]] = {}
     for i, start in starts.items():
         near = round(start.spread / SPREAD_STEP) * SPREAD_STEP
         groups.setdefault((start.preshape, near), []).append(i)
-    count = len(proposals)
     columns = {name: np.full(count, np.nan) for name in ("score", *COLUMNS)}
     columns["touch"] = np.full((count, hand.num_fingers), np.nan)
     for (preshape, near), rows in groups.items():
-        chosen = [starts[i] for i in rows]
-        closings = _closed(solids, hand.at(preshape), near, chosen)
-        found = {name: closings[name].mean(axis=(0, 2)) for name in ("score", *COLUMNS)}
-        X_TG = np.array([start.X_OG for start in chosen])
-        found |= features_of(closings, points, X_TG, near)
+        closings = _closed(solids, hand.at(preshape), near, [starts[i] for i in rows])
+        found = {name: values.mean(axis=(0, 2)) for name, values in closings.items()}
         used = ~unused_fingers(hand.unused_in(preshape), hand.num_fingers)
         columns["touch"][np.array(rows)[:, None], np.flatnonzero(used)] = found.pop("touch")
         for name, values in found.items():
-            columns.setdefault(name, np.full(count, np.nan))[rows] = values
+            columns[name][rows] = values
     return columns
 
 

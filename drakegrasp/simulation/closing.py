@@ -67,18 +67,13 @@ def close_on(
         Features by name, (n,) unless another shape is given:
             `score`, how well the hand would hold, 0 to 1, an order only; 0 if it is not free;
             `clearance`, `table`, distances of the open hand from solid and table [m], negative
-            inside, at most `FAR`; `free`, whether both are above `-DEEP`;
-            `touch` (n, k), whether each pad touches; `robust`, whether the hand is free and all
-            required pads touch;
-            `gaps` (n, k), `gap`, distances of the pads, and of the farthest required one [m];
-            `pushes` (n, k), `push`, cosines between the motion of the pads and the inward normals,
-            and the smallest of required pads;
+            inside, at most `FAR`;
+            `touch` (n, k), whether each pad touches; `robust`, whether the hand is free, at most
+            `DEEP` inside, and all required pads touch;
+            `gap`, distance of the farthest required pad [m];
+            `push`, smallest cosine between the motion of a required pad and the inward normal;
             `opposition`, how well the normals balance, 0 to 1;
-            `arm`, `above`, distance of the contacts' centre from the solid's, horizontally and
-            upwards [m];
-            `closed` (n, k), how far each finger closed, 0 to 1;
-            `heights` (n, k), heights of the pads [m];
-            `width`, largest distance of a pad from the contacts' centre [m].
+            `arm`, horizontal distance of the contacts' centre from the solid's [m].
 
     Raises:
         HandError: If several fingers move one link.
@@ -104,7 +99,7 @@ def close_on(
     touch, needed = gaps < PAD_GAP, hand.required
     opposition, middle = _opposition(p_SQ, n_S, touch)
     free = np.minimum(clearance, table) > -DEEP
-    p_middle_T = dot((middle - solid.middle)[:, None], X_TS[:3, :3])
+    p_middle_T = dot((middle - solid.middle)[:, None], X_TS[:2, :3])
     features = {
         "clearance": np.minimum(clearance, FAR),
         "table": np.minimum(table, FAR),
@@ -112,15 +107,8 @@ def close_on(
         "gap": gaps[:, needed].max(axis=1),
         "push": push[:, needed].min(axis=1),
         "opposition": opposition,
-        "arm": norm(p_middle_T[:, :2]),
+        "arm": norm(p_middle_T),
         "robust": free & touch[:, needed].all(axis=1),
-        "free": free,
-        "gaps": gaps,
-        "pushes": push,
-        "closed": places / [len(path.angles) - 1 for path in paths.fingers],
-        "heights": dot(p_SQ, X_TS[2, :3]) + X_TS[2, 3],
-        "above": p_middle_T[:, 2],
-        "width": norm(p_SQ - middle[:, None]).max(axis=1),
     }
     logit = np.full(len(X_SG), CONSTANT)
     for name, weight in WEIGHTS.items():

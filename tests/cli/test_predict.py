@@ -64,7 +64,8 @@ def predict(files: Path, words: str):
         ("cloud.npy --units cm", "must be points (n, 3) of one object"),
         ("cloud.npy --mask cloud.npy", "--mask must be given with a depth image only, got a cloud"),
         ("cloud.npy --split test", "--split must be given with scenes only, got a cloud"),
-        ("cloud.npy --network magic", "got 'magic'"),
+        ("cloud.npy --set hand=magic", "got 'magic'"),
+        ("cloud.npy --simulate -1", "Must be >= 0"),
         ("cloud.npy --count 0", "Must be >= 1"),
         ("one.npy --units m", "must be a cloud (n, 3), got (4, 5): a depth image needs --camera"),
         (NINE, "--mask must be given with a depth image, got none"),
@@ -109,16 +110,30 @@ def test_no_file_but_postures_is_replaced(files: Path, old: str) -> None:
     assert (files / "out.h5").read_bytes() == before
 
 
-def test_a_file_of_postures_is_replaced(files: Path) -> None:
-    for count in ("5", "3"):
-        result = predict(files, f"cloud.npy --count {count}")
-        assert (result.exit_code, result.stdout) == (0, f"{files / 'out.h5'}\n"), result.output
-    with h5py.File(files / "out.h5") as file:
-        assert len(file["confidence"]) == 3
+@pytest.mark.sim
+def test_lifts_change_the_chances_and_what_to_expect_is_printed(files: Path) -> None:
+    """The second file replaces the first. A folder with a name that is not written does not matter.
+
+    A view shows more than its cloud.
+    """
+    (files / "out.jsonl").mkdir()
+    told = []
+    for words in ("cloud.npy --simulate 0", "cloud.npy --simulate 1", f"{SEEN} --simulate 1"):
+        result = predict(files, f"{words} --set objects.mass=0.3 --count 3")
+        assert result.exit_code == 0, result.output
+        told.append(result.stderr.splitlines()[-1])
+        with h5py.File(files / "out.h5") as file:
+            confidence = file["confidence"][:]
+        assert len(confidence) == 3 and (np.diff(confidence) <= 0.0).all()
+        assert f"{confidence[0]:.0%}" in told[-1]
+    assert "none was lifted" in told[0]
+    assert "1 lifted on the object completed from the cloud" in told[1]
+    assert "1 lifted on the object completed from the view" in told[2]
+    assert "chance" not in predict(files, "cloud.npy --simulate 0 --quiet").stderr
 
 
 def test_a_pose_that_is_given_is_checked_with_the_image(files: Path) -> None:
-    result = predict(files, f"{SEEN} --camera-pose X_TC.npy --count 1")
+    result = predict(files, f"{SEEN} --camera-pose X_TC.npy --count 1 --simulate 0")
     assert result.exit_code == 0, result.output
     assert "% of the pixels beside the object; the camera is" in result.stderr
 
@@ -130,7 +145,7 @@ def test_a_png_is_in_millimetres_unless_its_scale_is_given(files: Path) -> None:
         Image.fromarray(np.rint(depth / unit).astype(np.uint16)).save(files / f"{name}.png")
     heights = []
     for seen in ("depth.npy", "mm.png", "quarters.png --depth-scale 0.00025"):
-        result = predict(files, SEEN.replace("depth.npy", seen) + " --count 1")
+        result = predict(files, SEEN.replace("depth.npy", seen) + " --count 1 --simulate 0")
         assert result.exit_code == 0, result.output
         heights += re.findall(r"the camera is (\d+) mm above it", result.stderr)
     np.testing.assert_allclose(list(map(int, heights)), [1e3 * X_TC[2, 3]] * 3, atol=1.0)

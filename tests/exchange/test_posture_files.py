@@ -117,12 +117,12 @@ def test_all_that_is_known_is_written(tmp_path):
     np.savez(tmp_path / "all.npz", X_FG=np.tile(np.eye(4), (3, 1, 1)), object=["mug"] * 3, **known)
     table = read_attempts(tmp_path / "all.npz", hand)
     assert not any(table.invalid)
-    write_attempts(tmp_path / "all.h5", table, hand, network="barrett-1")
+    write_attempts(tmp_path / "all.h5", table, hand)
     again = dict(read_attempts(tmp_path / "all.h5", hand))
     for name, values in table:
         np.testing.assert_array_equal(again[name], values, err_msg=name)
     with h5py.File(tmp_path / "all.h5") as file:
-        assert file.attrs["hand"] == hand.name and file.attrs["network"] == "barrett-1"
+        assert file.attrs["hand"] == hand.name
         assert file.attrs["drakegrasp"] == drakegrasp.__version__
 
     with pytest.raises(GraspError, match="row 1: of no use"):

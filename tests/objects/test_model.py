@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,16 @@ def test_box_has_the_closed_form(tmp_path):
     np.testing.assert_allclose(model.p_OOcm, 0.0, atol=1e-12)
     np.testing.assert_allclose(model.I_OOcm_O, box_inertia(0.7, *BOX), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(model.half_extents, np.array(BOX) / 2.0, rtol=1e-9)
+
+
+def test_a_used_object_is_the_same_in_another_process(tmp_path):
+    """The R-tree of trimesh is empty once it was pickled, and contacts had no nearest face."""
+    model = prepare(write(tmp_path / "a.obj", box()))
+    points, normals = np.array([[BOX[0] / 2.0, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
+    fit = fit_contacts(model, points, normals)
+    sent = pickle.loads(pickle.dumps(model))
+    assert fit_contacts(sent, points, normals).distance == fit.distance == pytest.approx([0.0])
+    np.testing.assert_array_equal(sent.collision_faces, model.collision_faces)
 
 
 def test_sphere_and_cylinder_approach_the_closed_form(tmp_path):

@@ -1,0 +1,164 @@
+"""Predictions: from what a camera saw to grasps, the best first. No network is needed.
+
+Input: an object's visible points in {T}, where the table is z = 0, or the views of scenes. Output:
+`Attempts` with a confidence, which `exchange.attempts.write_attempts` writes, a robot executes, a
+build tries and a score judges. Grasps are proposed (`scoring.proposals`) and ordered
+(`scoring.ranking`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.scenes import SceneDataset
+from drakegrasp.errors import GraspError, TooLittleSeenError
+from drakegrasp.frames import invert_pose, unpack_pose
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.settings import override_config
+from drakegrasp.runtime.executor import Executor, in_order, run_here
+from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.scoring.proposals import propose
+from drakegrasp.scoring.ranking import Ranking, rank
+from drakegrasp.simulation.attempts import Attempts, join_attempts
+from drakegrasp.vision.completion import View
+from drakegrasp.vision.depth_image import cloud_from_depth
+
+
+def predict(
+    cloud: Array,
+    view: View | None,
+    config: Config,
+    *,
+    simulate: int,
+    count: int | None = None,
+    name: str = "seen",
+) -> tuple[Attempts, Ranking]:
+    """Return grasps for what a camera saw of an object, the best first, and their ranking.
+
+    Args:
+        cloud: (n, 3), points of the object only, in {T} [m].
+        view: The image that shows them; None if there is none.
+        config: The hand, and the rules of the lifts.
+        simulate: See `rank`.
+        count: Maximum number of grasps; None for all that were proposed.
+        name: Name of the object in the table.
+
+    Returns:
+        Postures in the frame "table", whose `confidence` is the chance of a sample; and the ranking
+        of all proposals.
+
+    Raises:
+        GraspError, HandError, MeshError: See `propose` and `rank`.
+    """
+    hand = load_hand(config.hand_source)
+    proposals = propose(cloud, hand, name=name)
+    ranking = rank(proposals, cloud, hand, simulate=simulate, view=view, config=config)
+    order = ranking.order[:count]
+    chosen = proposals.at(order.tolist())
+    return replace(chosen, confidence=ranking.chance[order], row=np.arange(len(order))), ranking
+
+
+def predict_scenes(
+    path: Path,
+    *,
+    split: str = "test",
+    simulate: int = 0,
+    count: int | None = None,
+    overrides: Sequence[str] = (),
+    execute: Executor = run_here,
+    report: Report = silent,
+) -> tuple[Attempts, int, Hand]:
+    """Return grasps for all views of a split, in the frames of their objects.
+
+    The rows of the views are those of `drakegrasp score`, see `dataset.scenes.SceneRows`.
+
+    Args:
+        path: OUT/scenes.hdf5.
+        split: `train`, `valid` or `test`.
+        simulate: See `rank`; the lifts have the rules of the dataset.
+        count: Maximum number of grasps of a view; None for all.
+        overrides: Strings `"a.b=c"`, which change the configuration of the dataset.
+        execute: Executor of the views.
+        report: Called after each view.
+
+    Returns:
+        Postures with the row that each is for (`of_row`), its resting pose and its confidence; the
+        number of views that show too little of their object for any; and the hand.
+
+    Raises:
+        DataError: If the file cannot be used.
+        GraspError: If no view yields a posture, or a view is invalid.
+        ConfigError: If an override is invalid.
+    """
+    data = SceneDataset(path, points=None, split=split, negatives="none", balance="view", grasps=1)
+    if not len(data):
+        raise GraspError(f"{path}: {data.emptiness}")
+    config = override_config(read_manifest(data.path.parent).config, overrides)
+    work = partial(_predict_view, config, simulate, count)
+    tables = list[Attempts]()
+    for row, table in enumerate(in_order(execute)(work, _views(data))):
+        if table is not None:
+            tables.append(replace(table, of_row=np.full(len(table), row)))
+        report(row + 1, len(data))
+    if not tables:
+        raise GraspError(
+            f"{path}: must have views with a sample in {split} that show their object, got "
+            f"{len(data)} views"
+        )
+    return join_attempts(tables), len(data) - len(tables), load_hand(config.hand_source)
+
+
+class _SceneView(NamedTuple):
+    """A view of a scene: its object with resting pose and pose X_TO (4, 4), and the image."""
+
+    name: str
+    resting: int
+    X_TO: Array
+    view: View
+
+
+def _views(data: SceneDataset) -> Iterator[_SceneView]:
+    """Yield the views of a dataset in the order of its rows."""
+    views, scenes = data.tables["views"], data.tables["scenes"]
+    for i in data.views.tolist():
+        scene, seen = views["scene"][i], data.images(i)
+        X_TC = unpack_pose(views["X_TC"][i])
+        yield _SceneView(
+            name=data.names[scenes["object"][scene, 0]],
+            resting=int(scenes["resting"][scene, 0]),
+            X_TO=unpack_pose(scenes["X_TO"][scene, 0]),
+            view=View(depth=seen["depth"], mask=seen["mask"], K=seen["K"], X_TC=X_TC),
+        )
+
+
+def _predict_view(
+    config: Config, simulate: int, count: int | None, seen: _SceneView
+) -> Attempts | None:
+    """Return grasps for a view in {O}; None if it shows too little of its object.
+
+    Raises:
+        GraspError: If the view is invalid.
+    """
+    view = seen.view
+    try:
+        cloud = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
+        found, _ = predict(cloud, view, config, simulate=simulate, count=count, name=seen.name)
+    except TooLittleSeenError:
+        return None
+    except GraspError as error:
+        raise GraspError(f"a view of {seen.name}: {error}") from None
+    return replace(
+        found,
+        X_FG=multiply(invert_pose(seen.X_TO), found.X_FG),
+        frame="object",
+        resting=np.full(len(found), seen.resting),
+    )

@@ -1,0 +1,103 @@
+"""Grasps are predicted for what a camera saw, and lifts on the completed object decide."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.depth_images import X_TC, K, image
+
+import drakegrasp as dg
+from drakegrasp.scoring.predicting import _predict_view, _SceneView, predict
+from drakegrasp.vision.completion import View
+from drakegrasp.vision.depth_image import cloud_from_depth
+
+CONFIG = dg.load_config("fast", ["objects.mass=0.3"])
+
+
+@pytest.fixture(scope="module")
+def view():
+    """A box on a table before a wall, 80 x 60 mm wide and 100 mm high."""
+    depth, mask = image()
+    return View(depth=depth, mask=mask, K=K, X_TC=X_TC)
+
+
+@pytest.fixture(scope="module")
+def cloud(view):
+    return cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
+
+
+def test_grasps_come_with_the_best_first(cloud):
+    """They are those that `propose` returns, in the order of their chances."""
+    found, ranked = predict(cloud, None, CONFIG, simulate=0, name="mug")
+    assert found.frame == "table" and set(found.objects) == {"mug"} and not any(found.invalid)
+    assert (np.diff(found.confidence) <= 0.0).all() and 0.0 < found.confidence[0] < 1.0
+    assert found.row.tolist() == list(range(len(found)))
+    assert np.isnan(ranked.share).all() and ranked.completion == ""
+    proposed = dg.propose(cloud)
+    for name in ("X_FG", "q_grasp", "q_pregrasp"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(proposed, name)[ranked.order])
+    few, _ = predict(cloud, None, CONFIG, simulate=0, count=2)
+    np.testing.assert_array_equal(few.X_FG, found.X_FG[:2])
+    np.testing.assert_array_equal(few.confidence, found.confidence[:2])
+
+
+@pytest.mark.sim
+def test_lifts_end_at_the_first_grasp_that_holds_in_all_of_them(cloud, view):
+    proposed = dg.propose(cloud)
+    seen = dg.rank(proposed, cloud, simulate=8, view=view, config=CONFIG)
+    lifted = np.argsort(-seen.score, kind="stable")[: np.isfinite(seen.share).sum()]
+    assert set(lifted) == set(np.flatnonzero(np.isfinite(seen.share)))
+    assert (
+        seen.share[seen.order[0]] == 1.0
+        and np.nanmax(np.delete(seen.share, seen.order[0]), initial=0.0) < 1.0
+    )
+    assert seen.completion == "view" and seen.likely
+    assert seen.explain().startswith("the first grasp is a sample with a chance of 9")
+    # The same bits again.
+    again = dg.rank(proposed, cloud, simulate=8, view=tuple(view), config=CONFIG)
+    np.testing.assert_array_equal(again.share, seen.share)
+    assert dg.rank(proposed, cloud, simulate=1, config=CONFIG).completion == "cloud"
+
+
+@pytest.mark.sim
+def test_no_grasp_of_what_lies_flat_is_likely():
+    """A pen on the table: no lift is a sample, and the ranking says so."""
+    x, turn = np.meshgrid(np.linspace(-0.07, 0.07, 60), np.linspace(0.0, np.pi, 20))
+    pen = np.stack([x, 0.005 * np.cos(turn), 0.005 + 0.005 * np.sin(turn)], axis=-1).reshape(-1, 3)
+    ranked = dg.rank(dg.propose(pen), pen, simulate=2, config=CONFIG)
+    assert np.nanmax(ranked.share) == 0.0 and not ranked.likely
+    assert ranked.explain().startswith("no grasp is likely: the best one is a sample with a chance")
+    assert "10 mm high" in ranked.explain()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"simulate": -1}, "simulate must be a whole number, 0 or more, got -1"),
+        ({"view": (1, 2)}, "view must be depth, mask, K, X_TC, got 2 values"),
+        ({"view": (np.ones((9, 9)), np.ones((9, 9)), K, X_TC)}, "mask must be 0 beside"),
+    ],
+)
+def test_bad_arguments_are_one_line(cloud, given, said):
+    with pytest.raises(dg.GraspError, match=said):
+        dg.rank(np.eye(4), cloud, **given)
+    with pytest.raises(dg.ConfigError, match="config must be of the hand franka, got one of barr"):
+        dg.rank(np.eye(4), cloud, "franka", simulate=1, config=CONFIG)
+
+
+def test_a_view_without_its_object_is_told_from_a_bad_one(view):
+    """Too few points, none high enough, or a flat object yield no grasps; other mistakes raise."""
+    scene = _SceneView(name="box", resting=0, X_TO=np.eye(4), view=view)
+    lower = X_TC - np.eye(4, k=1) * [[0.0], [0.0], [0.12], [0.0]]
+    beside = np.zeros_like(view.mask)
+    beside[-20:-10, 60:90] = True
+
+    def predicted(**changes):
+        return _predict_view(CONFIG, 0, 1, scene._replace(view=view._replace(**changes)))
+
+    for changes in ({"mask": 0 * view.mask}, {"mask": beside}):
+        assert predicted(**changes) is None
+    depth = 1e3 * view.depth
+    for changes in ({"mask": view.mask[1:]}, {"K": 2 * K}, {"depth": depth}, {"X_TC": lower}):
+        with pytest.raises(dg.GraspError, match="view of box"):
+            predicted(**changes)
