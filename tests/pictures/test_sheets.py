@@ -22,7 +22,7 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
-from drakegrasp.pictures import sheets
+from drakegrasp.pictures import figures
 from drakegrasp.pictures.figures import (
     draw_sheet,
     sample_sheet,
@@ -87,8 +87,8 @@ def test_the_sheet_of_a_dataset_has_all_objects(
     assert notes(figure) == "3 of 3 samples, 2 of 2 objects with samples"
 
     # More objects than places have a sample each, and there is a limit.
-    monkeypatch.setattr(sheets, "PLACES", 4)
-    monkeypatch.setattr(sheets, "MOST", 6)
+    monkeypatch.setattr(figures, "PLACES", 4)
+    monkeypatch.setattr(figures, "MOST", 6)
     for objects, drawn, note in (
         (2, [10, 12, 11, 13], "4 of 10 samples, 2 of 2 objects with samples"),
         (5, [10, 11, 12, 13, 14], "5 of 10 samples, 5 of 5 objects with samples"),
