@@ -20,6 +20,7 @@ from drakegrasp.dataset.statistics import (
     count_splits,
     held_note,
     objects_without_samples,
+    refuse_unassembled,
 )
 from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
@@ -172,6 +173,7 @@ def print_table(table: Table) -> None:
 
 def print_stats(out: Path) -> None:
     """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
+    refuse_unassembled(out)
     console, funnel = make_console(), count_funnel(out)
     console.print(funnel_table(funnel))
     console.print()

@@ -341,7 +341,7 @@ class _Stored(BaseModel):
 
     schema_version: int
     config_hash: Hex
-    seed: int
+    seed: Seed
     config: dict[str, Any]
     split_by: str
     versions: dict[str, str]

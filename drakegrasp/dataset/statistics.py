@@ -11,10 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import (
-    AnyArray,
-    open_hdf5,
-)
+from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, open_samples, open_trials
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
@@ -108,6 +105,23 @@ def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     return True
 
 
+def refuse_unassembled(out: Path) -> None:
+    """Reject a dataset whose files are missing, or of another state than its manifest.
+
+    Raises:
+        DataError: If it is rejected.
+    """
+    if is_assembled(out):
+        return
+    for name in ASSEMBLED_FILES:
+        with open_trials(out / name) if name == TRIALS_FILE else open_samples(out / name):
+            pass  # the mistake of a file is told first
+    raise DataError(
+        f"{out}: files must be those of {FILE_NAME}, got others: `drakegrasp assemble` or the same "
+        "build again writes them"
+    )
+
+
 def palms_in_files(out: Path) -> dict[str, int]:
     """Return the number of palm poses of each object in the files; empty if there are none.
 
@@ -126,14 +140,9 @@ def count_funnel(out: Path) -> Funnel:
     """Return the funnel of a dataset.
 
     Raises:
-        DataError: If trials.hdf5 is missing or damaged, or not of the state of the manifest.
+        DataError: If trials.hdf5 is missing or damaged.
     """
     trials = Trials(out)
-    if not is_assembled(out):
-        raise DataError(
-            f"{out}: files must be those of {FILE_NAME}, got others: `drakegrasp assemble` or the "
-            "same build again writes them"
-        )
     count = len(trials.objects["name"])
 
     def zeros(*shape: int) -> npt.NDArray[np.int64]:
@@ -244,6 +253,7 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     Raises:
         DataError: If there is no dataset, or a file cannot be read.
     """
+    refuse_unassembled(out)
     funnel = count_funnel(out)
 
     def labelled(members: type[Outcome] | type[Removal], counts: AnyArray) -> dict[str, int]:

@@ -12,6 +12,7 @@ from helpers.datasets import SLIPPED, end_lift
 from helpers.golden import Golden
 
 from drakegrasp.cli.main import COMMANDS, app
+from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 
 
 def options_of(name: str) -> list[str]:
@@ -51,12 +52,13 @@ def test_options(golden: Golden) -> None:
 def test_output(out: Path, tmp_path: Path, golden: Golden, name: str, arguments: list[str]) -> None:
     if name == "stats":
         end_lift(out, SLIPPED, 0.02)
-    meshes, reject = tmp_path / "meshes", tmp_path / "reject.txt"
+    meshes, reject = tmp_path / "meshes", tmp_path / "reject.json"
     meshes.mkdir()
     trimesh.creation.box([50.0, 70.0, 150.0]).subdivide().export(meshes / "1_tall.obj")
     trimesh.creation.box([0.05, 0.07, 0.15]).subdivide().export(meshes / "2_box.obj")
     (meshes / "3_none.obj").write_text("v 0 0 0\n")
-    reject.write_text("0\n3\n")
+    bad = frozenset(AttemptKey("1_box_a", candidate, 0) for candidate in (0, 1))
+    write_decisions(reject, Decisions(rejected=bad))
     paths = {"OUT": out, "MESHES": meshes, "REJECT": reject}
     result = run(*(paths.get(argument, argument) for argument in arguments))
     errors = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
