@@ -50,10 +50,10 @@ from drakegrasp.verification.verify import verify_batch
 pytestmark = pytest.mark.sim
 
 EDGE = 0.06
-#: Contacts on two opposite faces of a cube of that edge, in {O}.
+#: Contacts on two opposite faces of a cube of that edge, in {O}; the hand holds it there.
 HALF = EDGE / 2.0
-POINTS = np.array([[HALF, 0.0, 0.0], [-HALF, 0.01, 0.0], [-HALF, -0.01, 0.0]])
-GRASP = np.concatenate([POINTS, np.sign(POINTS) * [1.0, 0.0, 0.0]])
+POINTS = np.array([[-0.025, HALF, -0.009], [0.025, HALF, -0.009], [0.0, -HALF, -0.009]])
+GRASP = np.concatenate([POINTS, np.sign(POINTS) * [0.0, 1.0, 0.0]])
 
 
 @pytest.fixture(scope="module")

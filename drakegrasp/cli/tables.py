@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE
 from rich.console import Console
@@ -26,9 +25,6 @@ from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import GROUPS, Outcome
-
-if TYPE_CHECKING:
-    pass
 
 #: Outcomes in the order of the funnel. Outcomes that only verdicts have are not among them.
 _FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
@@ -75,22 +71,6 @@ def make_table(
     return table
 
 
-def _table_of_objects(
-    title: str,
-    heads: Sequence[str],
-    funnel: Funnel,
-    row: Callable[[slice], list[str]],
-    caption: str = "",
-) -> Table:
-    """Return a table with a row per object and a row for all objects.
-
-    `row` returns the cells for a range of objects.
-    """
-    rows = ([name, *row(slice(i, i + 1))] for i, name in enumerate(funnel.names))
-    total = ["all", *row(slice(None))]
-    return make_table(title, ("object", *heads), rows, [total], caption=caption)
-
-
 def _head(outcome: Outcome) -> str:
     """Return the short head of an outcome's column."""
     short = outcome.label.replace("collision", "collis.").replace("fingertip", "tip")
@@ -108,6 +88,7 @@ def funnel_table(funnel: Funnel) -> Table:
     heads += [f"- {r.label}".replace("_", "\n") for r in removed] + ["samples", "distinct"]
 
     def row(objects: slice) -> list[str]:
+        """Return the cells for a range of objects."""
         outcomes = funnel.outcomes[objects].sum(axis=0).tolist()
         cells = [funnel.candidates[objects].sum(), sum(outcomes)]
         cells += [outcomes[o] for o in shown]
@@ -123,7 +104,10 @@ def funnel_table(funnel: Funnel) -> Table:
         held_note(funnel),
     ]
     caption = "\n".join(filter(None, notes))
-    return _table_of_objects("From palm poses to samples", heads, funnel, row, caption)
+    rows = ([name, *row(slice(i, i + 1))] for i, name in enumerate(funnel.names))
+    total = ["all", *row(slice(None))]
+    title = "From palm poses to samples"
+    return make_table(title, ("object", *heads), rows, [total], caption=caption)
 
 
 def split_table(counts: Sequence[SplitCount], rule: str) -> Table:
@@ -164,11 +148,6 @@ def _safe(text: str) -> str:
 def make_console() -> Console:
     """Return a console for tables, in which every table fits; a terminal wraps long lines."""
     return Console(width=WIDTH)
-
-
-def print_table(table: Table) -> None:
-    """Print a table to standard output."""
-    make_console().print(table)
 
 
 def print_stats(out: Path) -> None:

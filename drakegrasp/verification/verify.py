@@ -164,6 +164,7 @@ def _run(placed: PlacedObject, fit: WristFit, config: Config) -> tuple[Attempt, 
 
 def _of_posture(verdict: Verification) -> Verification:
     """Try a posture in each of its resting poses and preshapes; return the best verdict."""
+    # Try each of them.
     grasp, tried = verdict.grasp, list[tuple[Verification, str]]()
     hand, nothing = load_hand(grasp.config.hand_source), np.full(len(verdict.p_OQ), np.nan)
     for stand, (placed, given) in enumerate(zip(grasp.stands, grasp.postures, strict=True)):
@@ -182,6 +183,8 @@ def _of_posture(verdict: Verification) -> Verification:
             )
             found = replace(verdict, stand=stand, tries=(one,))
             tried.append((_judged(found), shape))
+
+    # The best, and the reason with what the posture left open.
     best, shape = max(
         tried, key=lambda f: (f[0].held, f[0].stable, f[0].precision, f[0].outcome.stage)
     )

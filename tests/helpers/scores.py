@@ -92,7 +92,7 @@ class FakeVerify:
             self.asked += 1
             held = self.holds(grasp)
             found: Any = SimpleNamespace(
-                method="hand",
+                grasp=SimpleNamespace(postures=()),
                 outcome=SimpleNamespace(label="success" if held else "dropped"),
                 success=held,
                 held=held,
