@@ -236,7 +236,6 @@ _AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
     ("size [mm]", lambda row: "x".join(f"{1e3 * e:.0f}" for e in row.extents or ()) or "-", True),
     ("bodies", lambda row: _number(row.bodies, ","), False),
     ("water-\ntight", lambda row: {True: "yes", False: "no", None: "-"}[row.watertight], False),
-    ("wall\n[mm]", lambda row: _number(row.wall, ".1f", 1e3), False),
     ("contact\n[mm]", lambda row: _number(row.collision_error, ".1f", 1e3), False),
 )
 

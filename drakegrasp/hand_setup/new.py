@@ -94,7 +94,6 @@ def draft_hand(
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise HandError(f"--out must be a new or empty folder, got {str(out)!r}")
     model = read_model(path, packages)
-    answers.refuse_unknown(model)
 
     best, findings = _find_best(model, path, answers, config)
     if out.exists():
@@ -151,8 +150,8 @@ def _drafts(
     if not grips or grips[0].cost > WORST:
         tips = ", ".join(joints[-1].child for joints, _ in fingers)
         raise HandError(
-            f"model: no fingers of {tips} close against each other: give positions of joints that "
-            "do not close with --joint NAME=POSITION"
+            f"model: no fingers of {tips} close against each other: say which fingers grasp "
+            "with --fingers LINK,LINK"
         )
 
     # Leave out grips whose links collide too early; if all do, the first of all is used.

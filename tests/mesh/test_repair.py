@@ -142,17 +142,6 @@ def test_loose_triangle_is_dropped(tmp_path):
     assert "1 pieces that enclose nothing" in model.notes[0]
 
 
-def test_seam_that_does_not_quite_meet_is_stitched(tmp_path):
-    mesh = trimesh.Trimesh(
-        box().vertices[box().faces].reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False
-    )
-    mesh.vertices += np.random.default_rng(0).uniform(-1e-6, 1e-6, mesh.vertices.shape)
-    model = prepare(write(tmp_path / "a.obj", mesh))
-    assert_sound(model)
-    assert model.volume == pytest.approx(np.prod(BOX), rel=1e-3)
-    assert "stitched" in model.notes[0]
-
-
 def test_a_body_through_itself_counts_once(tmp_path):
     # A bent bar as one surface whose ends cross, like a pretzel.
     path = np.array([[0, 0, 0], [0.2, 0, 0], [0.2, 0.15, 0], [0.1, 0.15, 0], [0.1, -0.1, 0.0]])
