@@ -156,7 +156,7 @@ def new_hand(
     for finding in drafted.findings:
         _print(finding)
     picture = drafted.path.with_suffix(".png")
-    if drafted.findings[0].name != "files":
+    if drafted.findings[0].ok:
         _draw(drafted.path, picture)
         say(
             f"Look at {picture}: pads must face each other, and Gz (blue) must point out of the "

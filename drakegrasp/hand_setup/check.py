@@ -232,7 +232,19 @@ def check_hand(
 
 
 def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
-    """Yield the findings, up to a failed check that others depend on."""
+    """Yield the findings; a failed check leaves out the trial grasps."""
+    sound = True
+    for finding in check_files(name_or_yaml, config):
+        sound = sound and finding.ok
+        yield finding
+    if sound:
+        hand = load_hand(name_or_yaml)
+        for shape, line in GRASPS:
+            yield check_grasp(hand, config, shape, line)
+
+
+def check_files(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
+    """Yield the findings of the checks without a simulation, see `check_hand`."""
     # The files: without them there is no hand.
     try:
         hand = load_hand(name_or_yaml)
@@ -249,15 +261,6 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
     limits = check_limits(hand)
     yield limits
     yield check_couplings(hand)
-    if not limits.ok:
-        return
-    yield check_efforts(hand, config)
-
-    # Geometry, then grasps.
-    sound = True
-    for finding in check_geometry(hand):
-        sound = sound and finding.ok
-        yield finding
-    if sound:
-        for shape, line in GRASPS:
-            yield check_grasp(hand, config, shape, line)
+    if limits.ok:
+        yield check_efforts(hand, config)
+        yield from check_geometry(hand)

@@ -19,16 +19,7 @@ import yaml
 
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
-from drakegrasp.hand.checks import (
-    Finding,
-    check_couplings,
-    check_efforts,
-    check_geometry,
-    check_limits,
-    early_overlaps,
-    judge,
-    overlap_query,
-)
+from drakegrasp.hand.checks import Finding, early_overlaps, overlap_query
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.fingers import Answers, find_fingers, find_palm
 from drakegrasp.hand.draft.grips import Grip, find_grips, trace_finger
@@ -38,7 +29,7 @@ from drakegrasp.hand.draft.source import read_model
 from drakegrasp.hand.draft.vendor import VendorModel, write_urdf
 from drakegrasp.hand.parsing import ModelFile
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand_setup.check import GRASPS, check_grasp
+from drakegrasp.hand_setup.check import GRASPS, check_files, check_grasp
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.files import atomic_folder
 
@@ -119,7 +110,7 @@ def _find_best(
             # Try the palm frames of a grip until its geometry is sound, then whether it holds.
             for f, draft in enumerate(drafts):
                 file = _write(draft, Path(scratch) / f"{g}_{f}", path)
-                findings = _findings(file, config)
+                findings = tuple(check_files(file, config))
                 sound = all(finding.ok for finding in findings)
                 for shape, line in GRASPS if sound else ():
                     findings = *findings, check_grasp(load_hand(file), config, shape, line)
@@ -187,15 +178,3 @@ def _write(draft: Draft, folder: Path, path: Path) -> Path:
     )
     file.write_text("".join(f"# {line}\n" for line in lines) + text, encoding="utf-8")
     return file
-
-
-def _findings(file: Path, config: Config) -> tuple[Finding, ...]:
-    """Return the findings of the checks without a simulation."""
-    try:
-        hand = load_hand(file)
-    except HandError as error:
-        return (judge("files", [str(error).removeprefix(f"{file}: ")], ""),)
-    limits = check_limits(hand)
-    if not limits.ok:
-        return (limits,)
-    return limits, check_couplings(hand), check_efforts(hand, config), *check_geometry(hand)

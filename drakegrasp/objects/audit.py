@@ -170,9 +170,8 @@ def guess_units(size: float, scale: float) -> str | None:
 def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, Any]:
     """Return measures of an object and of its file's surface, vertices (n, 3) [m], faces (m, 3)."""
     # Volume within the file's surface, and size of the solid.
-    own, solid = model.visual_vertices, model.visual_faces.astype(np.int64)
     before = abs(signed_volume(vertices, faces))
-    x, y, z = np.ptp(own, axis=0).tolist()
+    x, y, z = np.ptp(model.visual_vertices, axis=0).tolist()
 
     return {
         "extents": (x, y, z),
