@@ -250,7 +250,8 @@ def check_files(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
         hand = load_hand(name_or_yaml)
         count = sum(map(len, link_shapes(hand.model).values()))
     except HandError as error:
-        yield judge("files", [str(error)], "")
+        own = f"{Path(name_or_yaml).absolute()}: "
+        yield judge("files", [str(error).removeprefix(own)], "")
         return
     joints, model = len(hand.joint_names), hand.model.path.name
     fine = f"{hand.num_fingers} fingers, {joints} joints, {count} shapes in {model}"

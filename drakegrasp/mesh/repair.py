@@ -7,8 +7,9 @@ outward. Notes list what was changed. A mesh that cannot be repaired without inv
 solid keeps its own vertices.
 
 The order matters: inner walls are dropped while neighbours are still known. Then the surface is
-separated into `components`, whose holes are closed. Finally the components are united (`union`), and
-the result is checked by generalised winding numbers, which are independent of the previous steps.
+separated into `components`, whose holes are closed. Finally the components are united (`union`),
+and the result is checked by generalised winding numbers, which are independent of the previous
+steps.
 """
 
 from __future__ import annotations
