@@ -36,7 +36,7 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
     winding_numbers,
 )
-from drakegrasp.mesh.union import separate, unite
+from drakegrasp.mesh.union import refuse_overlap, unite
 
 #: Vertices closer than this fraction of the diagonal are merged: above the rounding of files
 #: with eight digits, far below the detail of any scan.
@@ -148,7 +148,8 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
         notes.append(f"{holes} open rims were closed, {share:.1%} of the surface: solid there now")
 
     # Unite the components, and check the result.
-    vertices, faces = separate(*unite(closed, size, notes), notes)
+    vertices, faces = unite(closed, size, notes)
+    refuse_overlap(vertices, faces, notes)
     if not len(faces) or not is_solid_surface(faces) or signed_volume(vertices, faces) <= 0.0:
         raise MeshError("the repaired surface must be watertight with outward normals, got gaps")
     _drop_fragments(fragments, vertices, faces, total, notes)
