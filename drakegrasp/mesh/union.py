@@ -1,7 +1,7 @@
 """Union: closed components come in, one surface that encloses each point at most once goes out.
 
-Components may overlap, be inside of each other, and be inside out. One that passes through itself is
-rejected.
+Components may overlap, be inside of each other, and be inside out. One that passes through itself
+is rejected.
 """
 
 from __future__ import annotations
