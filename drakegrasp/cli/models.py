@@ -112,7 +112,6 @@ def new_hand(
     out: Folder,
     palm: Annotated[str | None, Parameter(metavar="LINK")] = None,
     fingers: Annotated[str | None, Parameter(metavar="LINK,LINK")] = None,
-    joints: Annotated[tuple[str, ...], Parameter(name="--joint", metavar="NAME=POSITION")] = (),
     effort: Annotated[float | None, Parameter(metavar="E", validator=Number(gt=0.0))] = None,
     packages: Annotated[tuple[str, ...], Parameter(name="--package", metavar="NAME=FOLDER")] = (),
 ) -> None:
@@ -127,7 +126,6 @@ def new_hand(
         out: A new folder for the hand's files.
         palm: The link from which the fingers branch.
         fingers: The fingertip links of the grasping fingers.
-        joints: The position of a joint that does not close [rad or m], as in the vendor's model.
         effort: Largest effort of each motor at its joint [N m, or N].
         packages: Folder of package://NAME/.
     """
@@ -137,11 +135,15 @@ def new_hand(
     # The user's answers.
     answers = Answers(
         fingers=tuple(fingers.split(",")) if fingers else (),
-        joints={name: _number(text) for name, text in _pairs("--joint", joints)},
         palm=palm,
         effort=effort,
     )
-    folders = {name: Path(text) for name, text in _pairs("--package", packages)}
+    folders = dict[str, Path]()
+    for text in packages:
+        name, _, folder = text.partition("=")
+        if not (name and folder):
+            raise UsageError(f"--package must be NAME=FOLDER, got {text!r}")
+        folders[name] = Path(folder)
     drafted = draft_hand(model, out, answers=answers, packages=folders)
 
     # The drafted hand.
@@ -150,7 +152,7 @@ def new_hand(
     for finding in drafted.findings:
         _print(finding)
     picture = drafted.path.with_suffix(".png")
-    if drafted.findings[0].name != "files":
+    if drafted.findings[0].ok:
         _draw(drafted.path, picture)
         say(
             f"Look at {picture}: pads must face each other, and Gz (blue) must point out of the "
@@ -159,22 +161,6 @@ def new_hand(
     say(f"Then: drakegrasp hand check {drafted.path}")
     if not all(finding.ok for finding in drafted.findings):
         sys.exit(1)
-
-
-def _pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Return the name and the value of each NAME=VALUE."""
-    parts = [text.partition("=") for text in texts]
-    for name, sign, value in parts:
-        if not (name and value):
-            raise UsageError(f"{option} must be NAME=VALUE, got {name + sign + value!r}")
-    return [(name, value) for name, _, value in parts]
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise UsageError(f"must be a number, got {text!r}") from None
 
 
 @hand.command(name="check")

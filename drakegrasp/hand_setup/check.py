@@ -232,13 +232,26 @@ def check_hand(
 
 
 def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
-    """Yield the findings, up to a failed check that others depend on."""
+    """Yield the findings; a failed check leaves out the trial grasps."""
+    sound = True
+    for finding in check_files(name_or_yaml, config):
+        sound = sound and finding.ok
+        yield finding
+    if sound:
+        hand = load_hand(name_or_yaml)
+        for shape, line in GRASPS:
+            yield check_grasp(hand, config, shape, line)
+
+
+def check_files(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
+    """Yield the findings of the checks without a simulation, see `check_hand`."""
     # The files: without them there is no hand.
     try:
         hand = load_hand(name_or_yaml)
         count = sum(map(len, link_shapes(hand.model).values()))
     except HandError as error:
-        yield judge("files", [str(error)], "")
+        own = f"{Path(name_or_yaml).absolute()}: "
+        yield judge("files", [str(error).removeprefix(own)], "")
         return
     joints, model = len(hand.joint_names), hand.model.path.name
     fine = f"{hand.num_fingers} fingers, {joints} joints, {count} shapes in {model}"
@@ -249,15 +262,6 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
     limits = check_limits(hand)
     yield limits
     yield check_couplings(hand)
-    if not limits.ok:
-        return
-    yield check_efforts(hand, config)
-
-    # Geometry, then grasps.
-    sound = True
-    for finding in check_geometry(hand):
-        sound = sound and finding.ok
-        yield finding
-    if sound:
-        for shape, line in GRASPS:
-            yield check_grasp(hand, config, shape, line)
+    if limits.ok:
+        yield check_efforts(hand, config)
+        yield from check_geometry(hand)

@@ -19,16 +19,7 @@ import yaml
 
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
-from drakegrasp.hand.checks import (
-    Finding,
-    check_couplings,
-    check_efforts,
-    check_geometry,
-    check_limits,
-    early_overlaps,
-    judge,
-    overlap_query,
-)
+from drakegrasp.hand.checks import Finding, early_overlaps, overlap_query
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.fingers import Answers, find_fingers, find_palm
 from drakegrasp.hand.draft.grips import Grip, find_grips, trace_finger
@@ -38,7 +29,7 @@ from drakegrasp.hand.draft.source import read_model
 from drakegrasp.hand.draft.vendor import VendorModel, write_urdf
 from drakegrasp.hand.parsing import ModelFile
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand_setup.check import GRASPS, check_grasp
+from drakegrasp.hand_setup.check import GRASPS, check_files, check_grasp
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.files import atomic_folder
 
@@ -94,7 +85,6 @@ def draft_hand(
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise HandError(f"--out must be a new or empty folder, got {str(out)!r}")
     model = read_model(path, packages)
-    answers.refuse_unknown(model)
 
     best, findings = _find_best(model, path, answers, config)
     if out.exists():
@@ -120,7 +110,7 @@ def _find_best(
             # Try the palm frames of a grip until its geometry is sound, then whether it holds.
             for f, draft in enumerate(drafts):
                 file = _write(draft, Path(scratch) / f"{g}_{f}", path)
-                findings = _findings(file, config)
+                findings = tuple(check_files(file, config))
                 sound = all(finding.ok for finding in findings)
                 for shape, line in GRASPS if sound else ():
                     findings = *findings, check_grasp(load_hand(file), config, shape, line)
@@ -151,8 +141,8 @@ def _drafts(
     if not grips or grips[0].cost > WORST:
         tips = ", ".join(joints[-1].child for joints, _ in fingers)
         raise HandError(
-            f"model: no fingers of {tips} close against each other: give positions of joints that "
-            "do not close with --joint NAME=POSITION"
+            f"model: no fingers of {tips} close against each other: say which fingers grasp "
+            "with --fingers LINK,LINK"
         )
 
     # Leave out grips whose links collide too early; if all do, the first of all is used.
@@ -188,15 +178,3 @@ def _write(draft: Draft, folder: Path, path: Path) -> Path:
     )
     file.write_text("".join(f"# {line}\n" for line in lines) + text, encoding="utf-8")
     return file
-
-
-def _findings(file: Path, config: Config) -> tuple[Finding, ...]:
-    """Return the findings of the checks without a simulation."""
-    try:
-        hand = load_hand(file)
-    except HandError as error:
-        return (judge("files", [str(error).removeprefix(f"{file}: ")], ""),)
-    limits = check_limits(hand)
-    if not limits.ok:
-        return (limits,)
-    return limits, check_couplings(hand), check_efforts(hand, config), *check_geometry(hand)

@@ -12,17 +12,13 @@ import numpy as np
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
-from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import (
     Faces,
     diagonal,
-    even_points,
     is_solid_surface,
-    on_faces,
     signed_volume,
-    unit_normals,
 )
-from drakegrasp.objects.model import AHEAD, ObjectModel, prepare_object
+from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import (
     UNITS,
     MeshSource,
@@ -36,13 +32,6 @@ Status = Literal["fit", "repaired", "refused"]
 
 #: Diagonals of objects that a hand grasps [m]; a unit that results in such a size is plausible.
 HOUSEHOLD = (0.03, 0.6)
-#: A fingertip may feel a wall thinner than this from behind [m].
-THIN_WALL = AHEAD
-#: Number of points at which the wall is measured, and the fraction of them that may be thinner than
-#: the reported thickness.
-WALL_POINTS, WALL_SHARE = 300, 0.05
-#: The ray through a wall begins this far below the surface [m].
-BELOW = 1e-6
 #: Densities of real objects, from foam to steel [kg/m^3].
 DENSITIES = (20.0, 8000.0)
 #: Fraction of the volume that a repair may change without a warning.
@@ -67,7 +56,6 @@ class AuditRow:
             with the given unit; None if it does, or if no unit fits.
         volume: Volume of the solid [m^3].
         volume_change: Volume that repair added to that within the file's faces, as a fraction.
-        wall: Thickness [m] that 95 % of the walls have.
         mass: Mass of the object [kg].
         density: Density of the object [kg/m^3].
         collision_faces: Number of faces for contact.
@@ -87,7 +75,6 @@ class AuditRow:
     units_guess: str | None = None
     volume: float | None = None
     volume_change: float | None = None
-    wall: float | None = None
     mass: float | None = None
     density: float | None = None
     collision_faces: int | None = None
@@ -180,33 +167,16 @@ def guess_units(size: float, scale: float) -> str | None:
     return min(usual, key=lambda unit: abs(np.log(fits[unit] / 0.15)), default=None)
 
 
-def wall_thickness(vertices: Array, faces: Faces) -> float:
-    """Return the thickness [m] that 95 % of a solid's walls have.
-
-    A thickness is the length of a ray along the inward normal until it leaves the solid.
-
-    Args:
-        vertices: (n, 3) [m].
-        faces: (m, 3).
-    """
-    points, picked = on_faces(vertices, faces, even_points(WALL_POINTS))
-    inward = -unit_normals(vertices[faces[picked]])
-    through = first_hits(vertices[faces], points + BELOW * inward, inward)
-    return float(np.quantile(through[np.isfinite(through)], WALL_SHARE))
-
-
 def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, Any]:
     """Return measures of an object and of its file's surface, vertices (n, 3) [m], faces (m, 3)."""
     # Volume within the file's surface, and size of the solid.
-    own, solid = model.visual_vertices, model.visual_faces.astype(np.int64)
     before = abs(signed_volume(vertices, faces))
-    x, y, z = np.ptp(own, axis=0).tolist()
+    x, y, z = np.ptp(model.visual_vertices, axis=0).tolist()
 
     return {
         "extents": (x, y, z),
         "volume": model.volume,
         "volume_change": model.volume / before - 1.0 if model.notes and before > 0.0 else 0.0,
-        "wall": wall_thickness(own, solid),
         "mass": model.mass,
         "density": model.density,
         "collision_faces": len(model.collision_faces),
@@ -224,10 +194,6 @@ def _warnings(row: AuditRow) -> Iterator[str]:
         yield f"its lengths may be in {row.units_guess}"
     if row.model is None:
         return
-    if row.wall is not None and row.wall < THIN_WALL:
-        yield (
-            f"walls of {row.wall * 1e3:.1f} mm, thin for a fingertip (below {THIN_WALL * 1e3:g} mm)"
-        )
     if row.density is not None and not DENSITIES[0] <= row.density <= DENSITIES[1]:
         yield f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density"
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:

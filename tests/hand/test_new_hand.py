@@ -176,12 +176,10 @@ def test_answers_override_guesses(tmp_path: Path) -> None:
         MITTEN,
         palm="palm",
         fingers=("index_far", "thumb_far"),
-        joints={"thumb_turn": 0.3},
         effort=0.5,
     )
     tree = yaml.safe_load(drafted.path.read_text())
     assert {finger["fingertip"] for finger in tree["fingers"]} == {"index_far", "thumb_far"}
-    assert tree["preshape"]["thumb_turn"] == 0.3
     limits = [finger["torque_limit"] for finger in tree["fingers"]]
     whole = yaml.safe_load(draft(tmp_path / "whole", MITTEN).path.read_text())
     assert max(limits) <= 0.5 * 1.6
@@ -189,16 +187,9 @@ def test_answers_override_guesses(tmp_path: Path) -> None:
     assert "middle_1" not in whole.get("preshape", {})
 
 
-def test_a_joint_that_is_given_a_position_does_not_close(tmp_path: Path) -> None:
-    drafted = draft(tmp_path, MITTEN, joints={"thumb_2": 0.4})
-    hand = load_hand(drafted.path)
-    assert hand.preshape["thumb_2"] == 0.4
-    assert hand.fingers[-1].coupled == ()
-
-
 def test_fingers_that_close_side_by_side_are_no_hand(tmp_path: Path) -> None:
     """The message says what may be answered."""
-    with pytest.raises(HandError, match=r"close against each other: .* --joint NAME=POSITION"):
+    with pytest.raises(HandError, match=r"close against each other: .* --fingers LINK,LINK"):
         draft(tmp_path, MITTEN, fingers=("index_far", "middle_far"))
 
 
@@ -207,8 +198,6 @@ def test_fingers_that_close_side_by_side_are_no_hand(tmp_path: Path) -> None:
     [
         ({"palm": "wrist"}, r"--palm must be one of body, .* got 'wrist'"),
         ({"fingers": ("left_jaw", "thumb")}, r"--fingers must be of .* got 'thumb'"),
-        ({"joints": {"thumb": 0.0}}, r"--joint must name one of left_slide, .* got 'thumb'"),
-        ({"joints": {"left_slide": 1.0}}, r"--joint left_slide must be 0..0.05, got 1"),
     ],
 )
 def test_an_answer_that_cannot_be_used_is_refused(

@@ -7,12 +7,12 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from helpers.mesh_files import load_mesh
 from helpers.meshes import BOX, assert_sound, box, prepare, without_faces, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.loading import load_mesh
 from drakegrasp.objects.audit import audit
 
 

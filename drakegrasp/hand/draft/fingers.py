@@ -9,7 +9,7 @@ The other joints (a spread, an abduction, a thumb's opposition) keep a position.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -48,28 +48,12 @@ class Answers:
     Attributes:
         palm: The link from which the fingers branch.
         fingers: Fingertip links of all fingers that grasp.
-        joints: Positions of joints that no finger closes [rad or m].
         effort: Largest effort of the motors [N m or N], if it is the same for all.
     """
 
     palm: str | None = None
     fingers: tuple[str, ...] = ()
-    joints: Mapping[str, float] = field(default_factory=dict)
     effort: float | None = None
-
-    def refuse_unknown(self, model: VendorModel) -> None:
-        """Reject answers about joints that the model does not have.
-
-        Raises:
-            HandError: If there are any.
-        """
-        for name, position in self.joints.items():
-            if name not in model.joints:
-                joints = ", ".join(model.joints)
-                raise HandError(f"--joint must name one of {joints}, got {name!r}")
-            lower, upper = model.joints[name].limits
-            if not lower <= position <= upper:
-                raise HandError(f"--joint {name} must be {lower:g}..{upper:g}, got {position:g}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,7 +117,7 @@ def find_fingers(
         joints = model.chain(tip, palm)
         if not joints or joints[0].parent != palm:
             raise HandError(f"--fingers must be links beyond the palm {palm!r}, got {tip!r}")
-        if closings := find_closings(model, joints, answers):
+        if closings := find_closings(model, joints):
             fingers.append((joints, closings))
     if len(fingers) < 2:
         raise HandError(
@@ -180,9 +164,7 @@ def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> l
     return [leaf for leaf in leaves if not any(is_bar(leaf, other) for other in leaves)]
 
 
-def find_closings(
-    model: VendorModel, joints: Sequence[VendorJoint], answers: Answers
-) -> list[Closing]:
+def find_closings(model: VendorModel, joints: Sequence[VendorJoint]) -> list[Closing]:
     """Return the methods by which a finger may close."""
     # Find the motors that bend it, and the possible positions of the other motors.
     motors: dict[str, _Moved] = {}
@@ -194,14 +176,12 @@ def find_closings(
         X = X @ joint.X_PJ
         axes.append(X[:3, :3] @ joint.axis)
     bending = {
-        leader: moved
-        for leader, moved in motors.items()
-        if leader not in answers.joints and _bends_finger(moved, joints, axes)
+        leader: moved for leader, moved in motors.items() if _bends_finger(moved, joints, axes)
     }
     if not bending:
         return []
     kept = {leader: moved for leader, moved in motors.items() if leader not in bending}
-    choices = [_positions(model, leader, answers) for leader in kept]
+    choices = [_positions(model.joints[leader]) for leader in kept]
     rests = tuple(positions[0] for positions in choices)
 
     # Try both directions.
@@ -231,11 +211,8 @@ def _bends_finger(moved: _Moved, joints: Sequence[VendorJoint], axes: Sequence[A
     return moved[-1][0] == last or (turns and bool(abs(axes[first] @ axes[-1]) > PARALLEL))
 
 
-def _positions(model: VendorModel, leader: str, answers: Answers) -> list[float]:
+def _positions(joint: VendorJoint) -> list[float]:
     """Return the positions at which a joint that does not close is tried, its rest first."""
-    if leader in answers.joints:
-        return [answers.joints[leader]]
-    joint = model.joints[leader]
     lower, upper = joint.limits
     rest = float(np.clip(0.0, lower, upper))
     if joint.slides or not WIDE <= upper - lower < np.inf:
