@@ -28,6 +28,7 @@ from drakegrasp.config import (
     NonNegativeCount,
     Number,
     Positive,
+    Seed,
     Share,
     parse_stored,
 )
