@@ -148,7 +148,7 @@ def test_files_that_the_docs_name_exist(page: Path) -> None:
 def test_each_stop_of_a_walk_is_a_function_of_its_module() -> None:
     page = read(ROOT / "docs" / "explanation" / "architecture.md")
     stops = re.findall(r"^\| \d+ \| `([\w/]+\.py)` `(\w+)` \|", page, re.MULTILINE)
-    assert len(stops) > 20
+    assert len(stops) > 15
     for module, name in stops:
         source = read(ROOT / "drakegrasp" / module)
         assert re.search(rf"^(def|class) {name}\b", source, re.MULTILINE), f"{module} {name}"
@@ -326,7 +326,7 @@ def test_python_of_the_docs_runs(
         assert replayed == "True"
         assert verdict.split()[0] in ("True", "False")
         assert explanation.startswith("The grasp of ")
-        assert {path.name for path in tmp_path.iterdir()} >= {"grasp.html", "grasp.png"}
+        assert {path.name for path in tmp_path.iterdir()} >= {"grasp.html"}
 
 
 def test_the_table_of_scripts_names_every_script_and_no_other() -> None:

@@ -19,7 +19,6 @@ from drakegrasp.cli.console import UsageError
 from drakegrasp.cli.help import CLUSTER, MORE
 from drakegrasp.errors import first_line
 from drakegrasp.foreign_files import ADDRESS
-from drakegrasp.generation.request import BUILTIN
 
 if TYPE_CHECKING:
     from cyclopts import Token
@@ -179,6 +178,7 @@ class What:
     def _resolved(self) -> Config:
         """Return the configuration, in which options are short forms of `--set`."""
         from drakegrasp.config import BUILD_PRESET
+        from drakegrasp.generation.request import BUILTIN
 
         builtin = given(per_class=self.per_class, seed=self.objects_seed)
         if builtin and self.objects != BUILTIN:

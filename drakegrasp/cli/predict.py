@@ -52,7 +52,7 @@ def predict(
     workers: Count | None = None,
     quiet: bool = False,
 ) -> None:
-    """Write grasps for what a camera saw, best first, with the chance that each is a sample.
+    """Write grasps for what a camera saw, best first.
 
     INPUT is the file scenes.hdf5 of a dataset, for all views of a split, in the rows of
     `drakegrasp score`; or a cloud of one object (.npy of shape (n, 3), or .ply), over a table that

@@ -17,7 +17,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
 from drakegrasp.dataset.paths import model_path, object_files
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
-from drakegrasp.errors import MachineError, MeshError
+from drakegrasp.errors import DrakegraspError, MachineError, MeshError
 from drakegrasp.frames import Array
 from drakegrasp.generation.directory import DatasetTask
 from drakegrasp.objects.model import ObjectModel, prepare_object
@@ -70,8 +70,8 @@ class PrepareTask(DatasetTask):
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The journal of an earlier run."""
-        return (self.journal,)
+        """The files of an earlier run."""
+        return self.outputs
 
     @property
     def _mesh_place(self) -> str:
@@ -149,7 +149,8 @@ def _drawing(model: ObjectModel, resting_poses: Array, config: Config) -> Drawin
 def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
     """Prepare one mesh, and return its name and its entry in the manifest.
 
-    The entry of a rejected mesh is a `RefusedMesh`.
+    The entry of a rejected mesh is a `RefusedMesh`. An object whose files are complete is not
+    prepared again.
 
     Raises:
         MeshError: If the mesh file cannot be read.
@@ -158,7 +159,11 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
     """
     out, name, config = task.out, task.source.name, task.config
     with disk_full_named(out):
+        # The worker or the client may have died before the object was in the manifest.
         read = _, digest = read_source(task.source)
+        entry = _entry_there(task, digest)
+        if entry is not None:
+            return name, entry
         if not task.restartable:
             return name, _prepared_entry(task, read)
 
@@ -181,6 +186,17 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
             with journal.step(PREPARE, PREPARE_SECONDS):
                 inject_fault(name)
                 return name, _prepared_entry(task, read)
+
+
+def _entry_there(task: PrepareTask, digest: str) -> ObjectEntry | None:
+    """Return the entry of an object whose files are complete, or None."""
+    try:
+        prepared = load_prepared(task.out, task.source.name, task.config)
+    except DrakegraspError:
+        return None
+    model = prepared.model
+    same = (model.class_name, model.mesh_sha256) == (task.source.class_name, digest)
+    return prepared.entry() if same and prepared.asked >= first_palms(task.config) else None
 
 
 def _prepared_entry(task: PrepareTask, read: tuple[bytes, str]) -> ObjectEntry | RefusedMesh:

@@ -244,7 +244,7 @@ def test_few_crashes_are_no_error(whole: Path) -> None:
     header = next(read_manifest(whole).headers())
     for crashed, said in ((9, 0), (1, 1)):
         outcomes = {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed}
-        counts.add(UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={}))
+        counts.add(UnitSummary(header=header, outcomes=outcomes, errors={}))
         assert len(counts.unexplained()) == said
 
 
@@ -268,7 +268,7 @@ def test_bar_counts_the_samples_of_a_target(whole: Path) -> None:
     for unit in (units[0] for units in by_object.values()):
         target.add(unit, [unit.start])
         outcomes = {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}
-        counts.add(UnitSummary(header=unit, outcomes=outcomes, seconds={}, errors={}))
+        counts.add(UnitSummary(header=unit, outcomes=outcomes, errors={}))
     assert shown == [
         (1, None, {"attempts": 3, "grasps": 2}),
         (2, None, {"attempts": 6, "grasps": 4}),

@@ -37,7 +37,7 @@ from drakegrasp.shapes.catalog import BuiltinObject
 from drakegrasp.verification.prediction import FRAMES
 
 #: Commands that take any setting of a configuration.
-SETTINGS_OF = ("build", "submit", "verify", "score", "bench-set")
+SETTINGS_OF = ("build", "submit", "predict", "verify", "score", "bench-set")
 
 
 def test_help_answers_without_loading_the_simulator() -> None:

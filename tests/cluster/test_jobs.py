@@ -133,7 +133,7 @@ def test_nothing_that_is_typed_runs(
     assert set(taken) >= TAKEN
     calls = (tmp_path / "calls").read_text().split()
     assert calls == ["python", KINDS[kind], "drakegrasp"] * len(taken)
-    assert len(options) > 30
+    assert len(options) >= 30
 
 
 def test_what_jobqueue_yaml_states_stays_shell_code(tmp_path: Path) -> None:

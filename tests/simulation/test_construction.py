@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.objects import model_of
+from helpers.hands import write_tongs
+from helpers.objects import from_above, model_of, standing
 from pydrake.multibody.plant import DiscreteContactApproximation
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import BodyIndex, RigidBody
 
 from drakegrasp.config import Config
-from drakegrasp.hand.description import Hand
+from drakegrasp.frames import X_WT
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.parsing import position_order
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import (
@@ -23,6 +26,10 @@ from drakegrasp.simulation.construction import (
 )
 from drakegrasp.simulation.scene import (
     Scene,
+    hand_joint_names,
+    release,
+    reset_attempt,
+    reset_object,
 )
 
 pytestmark = pytest.mark.sim
@@ -89,13 +96,14 @@ def test_materials_are_the_configured_ones(cone: ObjectModel, config: Config, ha
             assert set(properties(scene, body, "hydroelastic", "hydroelastic_modulus")) == {modulus}
 
 
-def test_steps_are_the_configured_ones(cone: ObjectModel, config: Config, hand: Hand) -> None:
+def test_solver_and_step_are_the_configured_ones(
+    cone: ObjectModel, config: Config, hand: Hand
+) -> None:
     physics = override_config(config, ["physics.time_step=0.003", "physics.coarse_steps=4"]).physics
     scene = build_scene(cone, physics, hand)
     assert scene.coarse_scene is not None
     for plant, step in ((scene.plant, 0.003), (scene.coarse_scene().plant, 0.012)):
-        expected = DiscreteContactApproximation.kLagged
-        assert plant.get_discrete_contact_approximation() == expected
+        assert plant.get_discrete_contact_approximation() == DiscreteContactApproximation.kLagged
         assert plant.time_step() == pytest.approx(step)
 
 
@@ -137,6 +145,42 @@ def test_only_fingertips_of_different_fingers_meet(scene: Scene) -> None:
             assert meet <= {different}, (a.name(), b.name())
 
 
+def partners(scene: Scene, name: str) -> set[str]:
+    """Return the bodies that one of the object's surfaces meets now, by name."""
+    plant, inspector = scene.plant, scene.plant.EvalSceneGraphInspector(scene.context)
+    geometries = plant.GetCollisionGeometriesForBody(scene.object)
+    (surface,) = [g for g in geometries if inspector.GetName(g) == f"object::{name}"]
+    bodies = [plant.get_body(i) for i in map(BodyIndex, range(plant.num_bodies()))]
+    return {
+        body.name()
+        for body in bodies
+        if any(
+            not inspector.CollisionFiltered(surface, g)
+            for g in plant.GetCollisionGeometriesForBody(body)
+            if g != surface
+        )
+    }
+
+
+def test_hand_and_table_meet_a_surface_of_their_own(
+    scene: Scene, cube: ObjectModel, config: Config, hand: Hand
+) -> None:
+    """Whatever part of an attempt comes next, and whatever was allowed before."""
+    X_WO = X_WT @ standing(cube)
+    X_WG = X_WO @ from_above(cube, 0.1).X_OG
+    links = {scene.plant.get_body(i).name() for i in scene.plant.GetBodyIndices(scene.instance)}
+    for _ in range(2):
+        reset_attempt(scene, X_WO, X_WG, spread=0.0)
+        assert (partners(scene, "hand"), partners(scene, "table")) == (links, set())
+        release(scene)
+        assert (partners(scene, "hand"), partners(scene, "table")) == (links, {"table"})
+
+    alone = build_object_scene(cube, config.physics)
+    assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})
+    reset_object(alone, X_WO)
+    assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})
+
+
 def test_hand_meets_the_collision_mesh_and_the_table_its_hull(
     config: Config, hand: Hand, tmp_path: Path
 ) -> None:
@@ -156,3 +200,25 @@ def test_hand_meets_the_collision_mesh_and_the_table_its_hull(
             "object::hand": len(ring.faces),
             "object::table": len(model.resting_surface.faces),
         }
+
+
+def test_positions_are_in_the_order_of_a_tree_that_the_palm_is_the_root_of(
+    tmp_path: Path, cube: ObjectModel, config: Config
+) -> None:
+    """Not the arm that carries it: its wrist comes where the file has it, after the fingers."""
+    path = write_tongs(tmp_path)
+    model = tmp_path / "tongs.urdf"
+    box = '<link name="arm"><inertial><mass value="1"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" '
+    wrist = (
+        f'{box}ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="wrist" type="revolute">'
+        '<parent link="arm"/><child link="palm"/><axis xyz="1 0 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    )
+    model.write_text(model.read_text().replace("</robot>", f"{wrist}</robot>"))
+    path.write_text(f"{path.read_text()}preshape: {{wrist: 0.0}}\n")
+    hand = load_hand(path)
+    names = hand_joint_names(build_scene(cube, config.physics, hand))
+    assert names == list(position_order(hand.model, hand.palm_link))
+    assert names[-1] == "wrist"
+    # It has a unit, too, though no chain of the palm's has it.
+    assert hand.joint_units == dict.fromkeys(hand.joint_names, "rad")

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.objects import STANDOFF, from_above, standing
+from helpers.objects import CUBE, STANDOFF, from_above, standing
 
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import PAD_BAND, HalfSpace
+from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation import contacts as contacts_module
 from drakegrasp.simulation.construction import build_scene
@@ -63,6 +64,17 @@ def test_contact_off_the_pad_is_one_of_another_link(closed):
     assert not contacts.f_Q_O[0].any()
     assert contacts.area[0] == contacts.penetration[0] == 0.0
     assert judge_closed(contacts.touching, contacts.other_links, False).item()
+
+
+def test_patch_over_the_border_is_the_fingertips(closed):
+    """As a whole, where most of it is on the pad or its band: nothing of it changes."""
+    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
+    x = _contact_in_link(closed, whole)
+    part = with_pads(closed, ((1.0, 0.0, 0.0, x + 0.5 * PAD_BAND),), EVERYWHERE, EVERYWHERE)
+    assert part.other_links == 0
+    assert np.array_equal(part.f_Q_O, whole.f_Q_O)
+    assert np.array_equal(part.p_OQ, whole.p_OQ)
+    assert np.array_equal(part.area, whole.area)
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.0])
@@ -161,6 +173,16 @@ def test_contact_point_is_where_drakes_force_acts(closed: Scene) -> None:
     np.testing.assert_allclose(found.f_Q_O, forces, atol=1e-9)
 
 
+def test_depth_of_a_fingertip_is_how_far_it_is_in_the_cube(closed: Scene) -> None:
+    """A convex shape is deepest at a corner. Drake's field of pressure is not quite a distance."""
+    found, hand = read_contacts(closed), closed.hand
+    for k, tip in enumerate(closed.fingertips):
+        corners = np.concatenate(link_shapes(hand.model)[hand.fingers[k].fingertip])
+        X_OF = invert_pose(closed.pose(closed.object)) @ closed.pose(tip)
+        y = np.abs(transform_points(X_OF, corners)[:, 1])
+        assert found.penetration[k] == pytest.approx(CUBE / 2.0 - y.min(), rel=0.3)
+
+
 def test_hand_and_object_on_the_table_are_told_apart(scene: Scene, cube: ObjectModel) -> None:
     """A cube that stands there, then a hand that presses on the table beside it."""
     X_WO = X_WT @ standing(cube)
@@ -177,3 +199,54 @@ def test_hand_and_object_on_the_table_are_told_apart(scene: Scene, cube: ObjectM
     reset_attempt(scene, X_WO, X_WT @ X_TG, spread=0.0, closing=np.full(3, 1.3))
     presses = read_contacts(scene)
     assert (presses.object_on_table, presses.hand_on_table) == (False, True)
+
+
+def test_point_contacts_are_counted(closed: Scene) -> None:
+    """Those of the object; one of hand and table means that they touch."""
+    reader = contacts_module._Reader(closed)
+    grasped, table = closed.object.index(), closed.table.index()
+    tip, *_ = (body.index() for body in closed.fingertips)
+    for pair, count, on_table in (
+        ({tip, grasped}, 1, False),
+        ({grasped, table}, 2, False),
+        ({tip, table}, 2, True),
+    ):
+        reader.add_point_pair(pair)
+        found = reader.contacts()
+        assert (found.point_contacts, found.hand_on_table) == (count, on_table)
+
+
+def test_rest_of_a_split_patch_counts_by_its_own_force(closed: Scene) -> None:
+    """It carries what the pad does not."""
+    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
+    x = _contact_in_link(closed, whole)
+    beyond = (1.0, 0.0, 0.0, x + PAD_BAND + 1e-3)
+    part = with_pads(closed, (beyond,), EVERYWHERE, EVERYWHERE)
+    rest = float(np.linalg.norm(whole.f_Q_O[0] - part.f_Q_O[0]))
+    for factor, count in ((0.99, 1), (1.01, 0)):
+        physics = closed.physics.model_copy(update={"contact_force": factor * rest})
+        strict = replace(closed, physics=physics)
+        assert with_pads(strict, (beyond,), EVERYWHERE, EVERYWHERE).other_links == count
+
+
+def test_palm_on_the_object_is_another_link(scene: Scene, cube: ObjectModel) -> None:
+    """Open fingers, and the pad of the palm less than half of its thickness in the top."""
+    X_WO = X_WT @ standing(cube)
+    reset_attempt(scene, X_WO, X_WO @ from_above(cube, 0.001).X_OG, spread=0.0)
+    found = read_contacts(scene)
+    assert not found.touching.any()
+    assert found.other_links == 1
+    palm = scene.plant.GetBodyByName(scene.hand.palm_link)
+    assert bodies_on_object(scene) == {palm.index()}
+
+    # It counts by what it presses with, as Drake adds it up.
+    port = scene.plant.get_contact_results_output_port()
+    results = port.Eval(scene.plant.GetMyContextFromRoot(scene.simulator.get_context()))
+    forces = [
+        np.linalg.norm(results.hydroelastic_contact_info(i).F_Ac_W().translational())
+        for i in range(results.num_hydroelastic_contacts())
+    ]
+    for more, count in ((-0.5, 1), (0.5, 0)):
+        limit = max(forces) + more
+        strict = replace(scene, physics=scene.physics.model_copy(update={"contact_force": limit}))
+        assert read_contacts(strict).other_links == count

@@ -14,10 +14,11 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 
 from drakegrasp.config import Config
 from drakegrasp.errors import ConfigError
-from drakegrasp.frames import X_WT
+from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.settings import override_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.construction import build_scene
@@ -39,10 +40,15 @@ from drakegrasp.simulation.scene import (
     start_limits,
     transfer_state,
 )
-from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: Rounding and the compliance of Drake's joint limits [rad].
 STILL = np.deg2rad(0.02)
+
+
+def test_configuration_overrides_the_drive_of_the_hand(config: Config, hand: Hand) -> None:
+    assert drive_of(hand, config.lift) == "worm"
+    assert drive_of(hand, override_config(config, ["lift.drive=torque"]).lift) == "torque"
 
 
 def test_worm_needs_a_holding_torque(config: Config, tmp_path: Path) -> None:
@@ -66,6 +72,38 @@ def test_attempt_with_an_impossible_drive_is_refused(
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
     return box_model(tmp_path_factory.mktemp("carton"), [0.06, 0.06, 0.10])
+
+
+@pytest.fixture(scope="module")
+def pinch(carton: ObjectModel, config: Config, hand: Hand) -> dict[str, TrialRecord]:
+    """The carton, pinched symmetrically from above, by drive."""
+    scene = build_scene(carton, config.physics, hand)
+    return {
+        drive: run_attempt(
+            scene,
+            standing(carton),
+            from_above(carton, STANDOFF),
+            override_config(config, [f"lift.drive={drive}"]),
+        )
+        for drive in ("worm", "torque", "locked")
+    }
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("drive", ["worm", "locked"])
+def test_pinched_carton_stays_where_it_is(pinch: dict[str, TrialRecord], drive: str) -> None:
+    held = pinch[drive]
+    assert held.outcome is Outcome.SUCCESS
+    assert held.lift.slip < 1e-3
+    assert held.lift.turn < np.deg2rad(1.0)
+
+
+@pytest.mark.sim
+def test_fingers_without_a_worm_are_pushed_open(pinch: dict[str, TrialRecord]) -> None:
+    """Finger 3 is as strong as the two that it opposes: nothing centres the carton."""
+    pushed = pinch["torque"]
+    assert pushed.lift.slip > 15e-3
+    assert pushed.lift.turn > np.deg2rad(8.0)
 
 
 @pytest.mark.sim
@@ -127,6 +165,30 @@ def test_worm_yields_beyond_its_strength_and_holds_again(
 
 
 @pytest.mark.sim
+@pytest.mark.parametrize(("rate", "stands"), [(-1.5e-4, False), (-0.9e-4, True), (1.0, True)])
+def test_worm_yields_until_its_finger_opens_no_more(
+    scene: Scene, cube: ObjectModel, monkeypatch: pytest.MonkeyPatch, rate: float, stands: bool
+) -> None:
+    """A tenth of a milliradian per second is rest."""
+    _closed_on(scene, cube)
+    engage(scene, "worm")
+    for motor, own in zip(scene.motors, scene.effort_limits, strict=True):
+        motor.set_effort_limit(2.0 * own)
+    monkeypatch.setattr(drive_module, "closing_rates", lambda _: np.full(len(scene.motors), rate))
+    scene.simulator.get_monitor()(scene.simulator.get_context())
+    held = [motor.effort_limit() for motor in scene.motors] == [*scene.effort_limits]
+    disengage(scene)
+    assert held is stands
+
+
+@pytest.mark.sim
+def test_worm_holds_what_is_within_its_strength(scene: Scene, cube: ObjectModel) -> None:
+    """The loads that it carries are those of the contacts: force times lever, motor included."""
+    _closed_on(scene, cube)
+    assert opening_torques(scene) == pytest.approx([2.0, 2.0, 4.0], rel=0.02)
+
+
+@pytest.mark.sim
 def test_lift_leaves_the_hand_as_it_was(
     scene: Scene, cube: ObjectModel, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,6 +221,33 @@ def test_lift_leaves_the_hand_as_it_was(
     with pytest.raises(RuntimeError, match="no solution"):
         lifting.lift(scene, start_limits(config), config)
     assert limits() == before
+
+
+@pytest.mark.sim
+def test_lift_cut_off_in_coarse_steps_leaves_their_scene_as_it_was(
+    scene: Scene, cube: ObjectModel, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    coarse = scene.coarse_scene()
+    hand = coarse.hand
+    updates = []
+
+    def rest_then_fail(monitor: lifting._Monitor, current: Scene, *_: object) -> bool:
+        updates.append(current)
+        if current is coarse:
+            raise TrialTimeout
+        monitor.at_rest = True
+        return False
+
+    monkeypatch.setattr(lifting._Monitor, "update", rest_then_fail)
+    _closed_on(scene, cube)
+    with pytest.raises(TrialTimeout):
+        lifting.lift(scene, start_limits(config), config)
+    assert updates == [scene, coarse]
+    lower = [float(joint.position_lower_limits()[0]) for joint in coarse.closing_joints]
+    assert lower == [limits[0] for limits in coarse.closing_limits]
+    efforts = [motor.effort_limit() for motor in coarse.motors]
+    assert efforts == [finger.torque_limit for finger in hand.fingers]
+    assert coarse.simulator.get_monitor() is None
 
 
 #: Pulls the cube towards fingers 1 and 2 [N]; their motors hold what finger 3 pushes with.
@@ -197,3 +286,15 @@ def _pushed(scene: Scene, force: float, *, steps: int) -> np.ndarray:
     applied.F_Bq_W = SpatialForce(np.zeros(3), np.zeros(3))
     scene.plant.get_applied_spatial_force_input_port().FixValue(scene.context, [applied])
     return np.array(angles)
+
+
+def test_worm_holds_a_finger_that_is_a_little_beyond_its_limit(tmp_path: Path) -> None:
+    """A joint limit gives way by some micrometres; limits that cross would end Drake."""
+    hand = load_hand("franka")
+    scene = build_scene(box_model(tmp_path, [0.03] * 3), load_config().physics, hand)
+    X_WG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.2])
+    reset_attempt(scene, X_WT, X_WG, spread=0.0, closing=[0.04 + 1e-5] * 2)
+    engage(scene, "worm")
+    assert [j.position_lower_limits()[0] for j in scene.closing_joints] == [0.04]
+    disengage(scene)
+    assert [j.position_lower_limits()[0] for j in scene.closing_joints] == [0.0]

@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from helpers.meshes import G3DB, needs_g3db
 from hypothesis import Phase, assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError
+from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.objects.model import ObjectModel, make_object
+from drakegrasp.mesh.surfaces import half_edges, signed_volume
+from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
+from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation import settle as settle_module
-from drakegrasp.simulation.scene import ObjectScene
-from drakegrasp.simulation.settle import Resting, settle
+from drakegrasp.simulation.construction import build_object_scene
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
+from drakegrasp.simulation.settle import Resting, settle, snapped
 
 pytestmark = pytest.mark.sim
+
+#: Boxes of twelve triangles [mm].
+BOXES = [
+    (60, 80, 100),
+    (60, 90, 200),
+    (60, 60, 100),
+    (50, 50, 150),
+    (100, 100, 100),
+    (200, 30, 60),
+    (40, 120, 160),
+]
 
 
 def as_dropped(mesh: trimesh.Trimesh) -> ObjectModel:
@@ -37,6 +56,56 @@ def as_dropped(mesh: trimesh.Trimesh) -> ObjectModel:
 
 def tilt_deg(resting: Resting) -> float:
     return float(np.degrees(np.arccos(np.clip(resting.X_TO[2, 2], -1.0, 1.0))))
+
+
+SHAPES = {
+    **{"x".join(map(str, mm)): trimesh.creation.box(np.array(mm) / 1e3) for mm in BOXES},
+    "cylinder": trimesh.creation.cylinder(radius=0.03, height=0.12, sections=16),
+    "cone": trimesh.creation.cone(radius=0.04, height=0.10, sections=16),
+}
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_shape_with_a_base_of_few_triangles_rests_as_it_was_dropped(name: str, config: Config):
+    resting = settle(as_dropped(SHAPES[name]), config)
+    assert tilt_deg(resting) < 0.5
+    assert abs(resting.sink) < 1e-5
+    assert np.all(resting.X_TO[:2, 3] == 0.0)
+    assert resting.seconds < 2.0 and not resting.stopped and resting.notes == ()
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_trial_keeps_standing_what_rests(name: str, config: Config):
+    """On the surface and with the step of a trial, also what falls 2 cm."""
+    model = as_dropped(SHAPES[name])
+    X_TO = settle(model, config).X_TO.copy()
+    X_TO[2, 3] += 0.02
+    scene = build_object_scene(model, config.physics)
+    reset_object(scene, X_WT @ X_TO)
+    for _ in range(3):
+        advance(scene, 0.4)
+        R_WO = scene.pose(scene.object)[:3, :3]
+        assert np.degrees(np.arccos(np.clip(R_WO[2, 2], -1.0, 1.0))) < 0.5
+        assert settle_module._sink(scene) < 3e-4
+
+
+def test_surface_that_lands_is_the_collision_mesh_without_long_edges(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+):
+    """Not its hull, on which some objects rest otherwise."""
+    built, build = [], settle_module.build_object_scene
+
+    def watch(*args: Any, **kwargs: Any) -> ObjectScene:
+        built.append(kwargs["resting_surface"])
+        return build(*args, **kwargs)
+
+    monkeypatch.setattr(settle_module, "build_object_scene", watch)
+    ring = trimesh.creation.annulus(r_min=0.03, r_max=0.06, height=0.05, sections=16)
+    settle(as_dropped(ring), config)
+    (landed,) = built
+    a, b = landed.vertices[half_edges(landed.faces)].swapaxes(0, 1)
+    assert norm(b - a).max() <= 0.02 * (1.0 + 1e-6)
+    assert signed_volume(landed.vertices, landed.faces) == pytest.approx(ring.volume, rel=1e-6)
 
 
 #: The examples depend on what else is loaded; the search for a simpler failure takes minutes.
@@ -115,6 +184,26 @@ def test_what_lands_deep_is_raised_and_set_down_again(
     assert raised == pytest.approx([0.0] * 4, abs=1e-12)
 
 
+def test_object_that_left_the_table_is_refused(config: Config, monkeypatch: pytest.MonkeyPatch):
+    def fall(scene: ObjectScene, config: Config) -> bool:
+        settle_module._raise(scene, -1.0)
+        return False
+
+    monkeypatch.setattr(settle_module, "_wait_for_rest", fall)
+    monkeypatch.setattr(settle_module, "_sink", lambda _: 0.0)
+    with pytest.raises(MeshError, match="must come to rest on the table, got an object that left"):
+        settle(as_dropped(trimesh.creation.box([0.05] * 3)), config)
+
+
+@pytest.mark.parametrize("speed", [10.1, np.nan])
+def test_what_is_too_fast_while_it_settles_is_refused(
+    config: Config, monkeypatch: pytest.MonkeyPatch, speed: float
+):
+    monkeypatch.setattr(settle_module, "_speeds", lambda _: (speed, 0.0))
+    with pytest.raises(MeshError, match=r"its speed must stay below 10 m/s while it settles"):
+        settle(as_dropped(trimesh.creation.box([0.05] * 3)), config)
+
+
 @pytest.mark.parametrize(
     ("linear", "angular", "rests"), [(9e-4, 9e-3, True), (1.1e-3, 0.0, False), (0.0, 0.011, False)]
 )
@@ -145,6 +234,13 @@ def test_what_tips_over_or_sinks_in_is_noted(degrees: float, sink: float, note: 
     assert resting.notes == (() if note is None else (note,))
 
 
+def test_slab_on_its_corner_falls_on_a_face(config: Config):
+    mesh = trimesh.creation.box([0.10, 0.02, 0.08])
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5, [1, 0, 0]))
+    resting = settle(as_dropped(mesh), config)
+    assert np.degrees(resting.tilt) == pytest.approx(90.0 - np.degrees(0.5), abs=1.0)
+
+
 def test_what_rolls_is_stopped_and_noted(config: Config, monkeypatch: pytest.MonkeyPatch):
     """A cube that is said to move until 60 % of the longest time are over."""
     quick, measured = override_config(config, ["settle.max_time=2"]), settle_module._speeds
@@ -161,6 +257,34 @@ def test_what_never_rests_is_refused_with_its_speed(config: Config):
     strict = override_config(config, ["settle.max_time=0.1"])
     with pytest.raises(MeshError, match=r"must come to rest .* within 0\.1 s .* got .* m/s"):
         settle(ball, strict)
+
+
+@pytest.mark.nightly
+@needs_g3db
+@pytest.mark.slow
+def test_real_meshes_do_not_sink_into_the_table(config: Config):
+    sinks = {}
+    for source in find_meshes(Path(G3DB), units="cm")[::2]:
+        try:
+            model = prepare_object(source, config.objects)
+        except MeshError:
+            continue  # in another unit
+        sinks[source.name] = settle(model, config).sink
+    assert len(sinks) >= 14
+    assert max(sinks.values()) < 3e-4
+
+
+def test_pose_on_the_grid_is_the_pose_to_a_microradian():
+    """Any rotation: each entry of the matrix from the quaternion, and only the height stays."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        X_TO = make_pose(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3))
+        found = snapped(X_TO)
+        np.testing.assert_allclose(found[:3, :3], X_TO[:3, :3], atol=4e-6)
+        np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
+        assert found[:2, 3].tolist() == [0.0, 0.0]
+        assert found[2, 3] == pytest.approx(X_TO[2, 3], abs=2.0**-21)
+        assert (found[2, 3] * 2.0**20) % 1.0 == 0.0
 
 
 @pytest.mark.parametrize(
