@@ -23,7 +23,12 @@ from drakegrasp.mesh.surfaces import (
     face_areas,
     half_edges,
     signed_volume,
+    split_faces,
 )
+
+#: If two touching edges belong to one face, the faces between their new vertices still touch and
+#: are parted in a second turn; a third turn was never needed.
+MAX_PARTINGS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,6 +131,35 @@ def count_parts(vertices: Array, faces: Faces) -> int:
     if count == 1:
         return 1
     return sum(signed_volume(vertices, faces[piece == index]) > 0.0 for index in range(count))
+
+
+def part_touching_edges(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
+    """Return the same surface with as few edges of four or more faces as possible.
+
+    If a surface touches itself along an edge, the two faces that bound the same wedge of solid get
+    their own vertex at the centre of the edge, so that each half of the edge has two faces again.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+    """
+    for _ in range(MAX_PARTINGS):
+        # The pairs of half-edges at such edges, each pair once.
+        ids, counts = edge_ids(faces)
+        if not (counts > 2).any():
+            break
+        twins = pair_half_edges(vertices, faces, radial=True)
+        halves = np.arange(len(twins))
+        first = halves[(counts[ids] > 2) & (halves < twins)]
+
+        # A vertex for each pair, on both of its half-edges.
+        ends = half_edges(faces)[first]
+        midpoints = np.full(len(twins), -1, dtype=np.int64)
+        midpoints[first] = midpoints[twins[first]] = len(vertices) + np.arange(len(first))
+        new = (vertices[ends[:, 0]] + vertices[ends[:, 1]]) / 2.0
+        vertices = np.vstack((vertices, new))
+        faces = split_faces(vertices, faces, midpoints.reshape(-1, 3))
+    return vertices, faces
 
 
 # Half-edges

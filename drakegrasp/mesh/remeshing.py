@@ -23,7 +23,7 @@ import trimesh
 from drakegrasp.arithmetic import dot
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mesh.components import edge_ids, find_components
+from drakegrasp.mesh.components import edge_ids, find_components, part_touching_edges
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     MAX_OVERLAP,
@@ -49,6 +49,11 @@ from drakegrasp.mesh.surfaces import (
 DECIMATION_STEPS = (2.0, 3.0, 5.0, 7.0)
 #: Deviation, as a fraction of the diagonal, above which the second method is tried.
 FAITHFUL = 2e-3
+#: Deviation [m] above which the methods for scans are tried as well.
+COARSE = 2e-3
+#: Target of the methods for scans, as a fraction of the allowed faces, since parting adds some; and
+#: the larger target of a first decimation, after which fewer spikes of noise are left.
+PARTED, FIRST = 0.97, 5.0 / 3.0
 #: Fraction of its volume that a decimated mesh may gain or lose.
 MAX_VOLUME_CHANGE = 0.05
 #: Number of points on each surface at which the deviation of two surfaces is measured.
@@ -60,7 +65,9 @@ def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
 
     Quadric decimation (Garland and Heckbert 1997) keeps the shape better, but does not guarantee a
     closed surface; manifold3d's simplification does. The latter is tried if the former fails or
-    deviates by more than `FAITHFUL`. The closest result is returned.
+    deviates by more than `FAITHFUL`. If both fail or deviate by more than `COARSE`, as for noisy
+    thin walls, quadric decimation is tried again, with its surface parted where it then touches
+    itself. The closest result is returned.
 
     Raises:
         MeshError: If no method yields a closed surface of about the same volume.
@@ -69,14 +76,20 @@ def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
         return solid, 0.0
 
     # Keep the closest valid result; the first that is close enough ends the search.
+    faithful = FAITHFUL * diagonal(solid.vertices)
     best: tuple[Solid, float] | None = None
-    for candidate in (_decimate_quadric, _simplify_manifold):
+    for candidate, enough in (
+        (_decimate_quadric, faithful),
+        (_simplify_manifold, max(faithful, COARSE)),
+        (_decimate_parted, max(faithful, COARSE)),
+        (_decimate_twice, 0.0),
+    ):
         reduced = candidate(solid, max_faces)
         if reduced is not None and _is_sound(reduced, solid):
             error = surface_deviation(solid, reduced)
             if best is None or error < best[1]:
                 best = reduced, error
-        if best is not None and best[1] <= FAITHFUL * diagonal(solid.vertices):
+        if best is not None and best[1] <= enough:
             break
 
     if best is None:
@@ -127,14 +140,40 @@ def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
     return None
 
 
-def _simplify(solid: Solid, target: int, aggressiveness: float) -> tuple[Array, Faces]:
-    """Return vertices and faces of a quadric decimation.
+def _decimate_parted(solid: Solid, max_faces: int) -> Solid | None:
+    """Return the least aggressive decimation, parted where its surface touches itself, or None."""
+    target = int(PARTED * max_faces)
+    if len(solid.faces) <= target:
+        return solid  # fast_simplification rejects a target above the number of faces
+    for aggressiveness in DECIMATION_STEPS:
+        reduced = reduce_and_part(solid, target, aggressiveness)
+        if 0 < len(reduced.faces) <= max_faces:
+            return reduced
+    return None
+
+
+def _decimate_twice(solid: Solid, max_faces: int) -> Solid | None:
+    """Return `_decimate_parted` of a surface that was first reduced to somewhat more faces."""
+    between = int(FIRST * max_faces)
+    if len(solid.faces) <= between:
+        return None  # fast_simplification rejects a target above the number of faces
+    return _decimate_parted(reduce_and_part(solid, between, DECIMATION_STEPS[0]), max_faces)
+
+
+def reduce_and_part(solid: Solid, target: int, aggressiveness: float) -> Solid:
+    """Return a quadric decimation without duplicate faces and touching edges.
 
     Args:
         solid: The surface, which has more faces than `target`.
         target: Desired number of faces.
         aggressiveness: How fast the error may grow from round to round, see `DECIMATION_STEPS`.
     """
+    vertices, faces = part_touching_edges(*weld(*_simplify(solid, target, aggressiveness)))
+    return Solid(vertices=vertices, faces=faces)
+
+
+def _simplify(solid: Solid, target: int, aggressiveness: float) -> tuple[Array, Faces]:
+    """Return vertices and faces of a quadric decimation, see `reduce_and_part`."""
     vertices, faces = fast_simplification.simplify(
         np.ascontiguousarray(solid.vertices),
         np.ascontiguousarray(solid.faces),
