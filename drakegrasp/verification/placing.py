@@ -228,17 +228,17 @@ def objects_of_rows(
     names = dataset.column("object_props/object_name")[rows].tolist()
     resting = dataset.column("grasp_props/resting")[rows].astype(np.int64)
     known = _drawn(dataset, rows) if drawn else np.full((len(rows), 3), np.nan)
-    overridden = overridden_keys(overrides)
+    overridden, out = overridden_keys(overrides), dataset.path.parent
+    manifest = read_manifest(out)
     for name in dict.fromkeys(names):
-        stands = resting_objects(dataset.path.parent, name)
+        stands = resting_objects(out, name, manifest.config)
         of_object = [i for i, each in enumerate(names) if each == name]
         for i in sorted(of_object, key=resting.__getitem__):
             yield i, *under(stands[resting[i]], config, known[i], overridden)
 
 
-def resting_objects(out: Path, name: str) -> list[PlacedObject]:
-    """Return an object of a dataset in each of its resting poses."""
-    config = read_manifest(out).config
+def resting_objects(out: Path, name: str, config: Config) -> list[PlacedObject]:
+    """Return an object of a dataset, with its configuration, in each of its resting poses."""
     prepared = load_prepared(out, name, config)
     return [
         PlacedObject(model=prepared.model, X_TO=X_TO, config=config)

@@ -123,11 +123,13 @@ def place_on_dataset(
         DataError: If the dataset cannot be used.
     """
     _refuse_mesh_frame(table)
-    names = [entry.name for entry in read_manifest(out).objects]
+    manifest = read_manifest(out)
+    names = [entry.name for entry in manifest.objects]
     table, found = table.refuse(unknown_objects(table, names)), list[PlacedGrasp]()
     for name in dict.fromkeys(table.objects):
         # An object that does not exist is known by its name alone.
-        stands = resting_objects(out, name if name in names else names[0])
+        there = name if name in names else names[0]
+        stands = resting_objects(out, there, manifest.config)
         if name not in names:
             model = replace(stands[0].model, name=name)
             stands = [replace(stands[0], model=model, X_TO=np.full((4, 4), np.nan))]
