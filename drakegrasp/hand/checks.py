@@ -434,16 +434,15 @@ def early_overlaps(
     """
     found: dict[tuple[str, str], float] = {}
     for posture in postures:
-        met = False
-        for links, depth in overlaps(posture):
-            if len({movers.get(link) for link in links} - {None}) < 2:
-                continue
-            if set(links) <= set(tips):
-                met = True
-            else:
-                found[links] = max(found.get(links, 0.0), depth)
-        if met:
+        met = [
+            (links, depth)
+            for links, depth in overlaps(posture)
+            if len({movers.get(link) for link in links} - {None}) == 2
+        ]
+        if any(set(links) <= set(tips) for links, _ in met):
             break
+        for links, depth in met:
+            found[links] = max(found.get(links, 0.0), depth)
     return found
 
 

@@ -92,7 +92,8 @@ def draft_hand(
     with atomic_folder(out) as folder:
         written = _write(best, folder, path)
         for licence in chain.from_iterable(path.resolve().parent.glob(name) for name in LICENCES):
-            shutil.copyfile(licence, folder / licence.name)
+            if licence.is_file():
+                shutil.copyfile(licence, folder / licence.name)
     return NewHand(path=out / written.name, notes=model.notes, findings=findings)
 
 

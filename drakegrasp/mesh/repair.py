@@ -6,15 +6,16 @@ outward. Notes list what was changed. A mesh that cannot be repaired without inv
 `MeshError` with the reason; `drakegrasp.objects.model` adds the file's name. A mesh that is a clean
 solid keeps its own vertices.
 
-The order matters: inner walls are dropped while neighbours are still known. Then the surface is
-separated into `components`, whose holes are closed. Finally the components are united (`union`),
-and the result is checked by generalised winding numbers, which are independent of the previous
-steps.
+The order matters: gaps are stitched and inner walls are dropped while neighbours are still known.
+Then the surface is separated into `components`, whose holes are closed. Finally the components are
+united (`union`), and the result is checked by generalised winding numbers, which are independent of
+the previous steps.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.errors import MeshError
@@ -25,13 +26,16 @@ from drakegrasp.mesh.components import (
     face_components,
     find_components,
     pair_half_edges,
+    part_touching_edges,
 )
 from drakegrasp.mesh.surfaces import (
     Faces,
     Solid,
     compact,
+    connect,
     diagonal,
     face_areas,
+    half_edges,
     is_solid_surface,
     signed_volume,
     winding_numbers,
@@ -44,6 +48,8 @@ WELD = 1e-8
 #: Maximum number of pieces of a surface: each takes milliseconds, and no object that a hand lifts
 #: has more.
 MOST_PIECES = 5_000
+#: Rims closer than this fraction of the diagonal are the two sides of one seam.
+STITCH = 1e-4
 #: A component encloses nothing if its mean thickness is below this fraction of its diagonal.
 FLAT = 1e-4
 #: Fraction of the surface that filled holes may make up: an open box just passes (1/6); a
@@ -99,8 +105,24 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
     Raises:
         MeshError: If the surface cannot become a solid without inventing shape.
     """
+    try:
+        return _repair(vertices, faces, [])
+    except MeshError as reason:
+        # Scans touch themselves along edges, where rims then cross: part these edges and try again.
+        touching = int((edge_ids(faces)[1] > 2).sum())
+        if not touching:
+            raise
+        note = f"the surface touched itself along {touching} edges and was parted there"
+        try:
+            return _repair(*part_touching_edges(vertices, faces), [note])
+        except MeshError:
+            raise reason from None
+
+
+def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
     # Make one surface, while neighbours are still known.
-    size, notes = diagonal(vertices), list[str]()
+    size = diagonal(vertices)
+    vertices, faces = _stitch(vertices, faces, notes)
     faces, walls = _drop_inner_walls(vertices, faces)
     total = float(face_areas(vertices, faces).sum())
     fragments = [(vertices[walls], "it ends at edges with three faces")] if len(walls) else []
@@ -154,6 +176,30 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
         raise MeshError("the repaired surface must be watertight with outward normals, got gaps")
     _drop_fragments(fragments, vertices, faces, total, notes)
     return Solid(vertices=vertices, faces=faces, notes=tuple(notes))
+
+
+def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Faces]:
+    """Return a surface whose nearly touching rim vertices are merged, if that closes edges."""
+    ids, counts = edge_ids(faces)
+    rim = np.unique(half_edges(faces)[counts[ids] == 1])
+    if not len(rim):
+        return vertices, faces
+
+    # Merge rim vertices that are close to each other, directly or through others between them.
+    pairs = cKDTree(vertices[rim]).query_pairs(STITCH * diagonal(vertices), output_type="ndarray")
+    _, labels = connect(pairs[:, 0], pairs[:, 1], len(rim))
+    _, first = np.unique(labels, return_index=True)
+    merged = np.arange(len(vertices))
+    merged[rim] = rim[first[labels]]
+    stitched = merged[faces]
+    stitched = stitched[(stitched != np.roll(stitched, 1, axis=1)).all(axis=1)]
+
+    # Keep the result only if fewer edges have an odd number of faces.
+    before, after = int((counts == 1).sum()), int((edge_ids(stitched)[1] == 1).sum())
+    if not len(stitched) or _odd_edges(stitched) >= _odd_edges(faces):
+        return vertices, faces
+    notes.append(f"{before - after} open edges were stitched together")
+    return compact(vertices, stitched)
 
 
 def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:

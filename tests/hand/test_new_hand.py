@@ -64,8 +64,8 @@ def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:
     assert [finding.text for finding in drafted.findings if not finding.ok] == []
     hand = load_hand(drafted.path)
     names = [finger.name for finger in hand.fingers]
-    assert names[-1] == "thumb"
-    assert sorted(names) == ["index", "middle", "thumb"]
+    assert names[-1] == "thumb_far"
+    assert sorted(names) == ["index_far", "middle_far", "thumb_far"]
     for finger in hand.fingers[:-1]:
         (coupling,) = finger.coupled
         assert coupling.ratio == pytest.approx(0.8)
@@ -78,7 +78,7 @@ def test_a_hand_of_four_fingers_grasps_with_three(tmp_path: Path) -> None:
     ring = MITTEN[MITTEN.index('<link name="index') : MITTEN.index('<link name="middle')]
     ring = ring.replace("index", "ring").replace("0 0.022 0", "0 0 0")
     hand = load_hand(draft(tmp_path, MITTEN.replace("</robot>", ring + "</robot>")).path)
-    assert len(hand.fingers) == 3 and hand.fingers[-1].name == "thumb"
+    assert len(hand.fingers) == 3 and hand.fingers[-1].name == "thumb_far"
 
 
 def test_a_mesh_without_thickness_gets_some_on_both_sides() -> None:
