@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.objects import model_of
+from helpers.objects import from_above, model_of, standing
 from pydrake.multibody.plant import DiscreteContactApproximation
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import BodyIndex, RigidBody
 
 from drakegrasp.config import Config
+from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
@@ -23,12 +24,32 @@ from drakegrasp.simulation.construction import (
 )
 from drakegrasp.simulation.scene import (
     Scene,
+    release,
+    reset_attempt,
+    reset_object,
 )
 
 pytestmark = pytest.mark.sim
 
 #: A cone on its side: neither its centre of mass nor its principal axes are those of {O}.
 RADIUS, HEIGHT = 0.03, 0.1
+
+
+def partners(scene: Scene, name: str) -> set[str]:
+    """Return the bodies that one of the object's surfaces meets now, by name."""
+    plant, inspector = scene.plant, scene.plant.EvalSceneGraphInspector(scene.context)
+    geometries = plant.GetCollisionGeometriesForBody(scene.object)
+    (surface,) = [g for g in geometries if inspector.GetName(g) == f"object::{name}"]
+    bodies = [plant.get_body(i) for i in map(BodyIndex, range(plant.num_bodies()))]
+    return {
+        body.name()
+        for body in bodies
+        if any(
+            not inspector.CollisionFiltered(surface, g)
+            for g in plant.GetCollisionGeometriesForBody(body)
+            if g != surface
+        )
+    }
 
 
 @pytest.fixture(scope="module")
@@ -156,3 +177,22 @@ def test_hand_meets_the_collision_mesh_and_the_table_its_hull(
             "object::hand": len(ring.faces),
             "object::table": len(model.resting_surface.faces),
         }
+
+
+def test_hand_and_table_meet_a_surface_of_their_own(
+    scene: Scene, cube: ObjectModel, config: Config, hand: Hand
+) -> None:
+    """Whatever part of an attempt comes next, and whatever was allowed before."""
+    X_WO = X_WT @ standing(cube)
+    X_WG = X_WO @ from_above(cube, 0.1).X_OG
+    links = {scene.plant.get_body(i).name() for i in scene.plant.GetBodyIndices(scene.instance)}
+    for _ in range(2):
+        reset_attempt(scene, X_WO, X_WG, spread=0.0)
+        assert (partners(scene, "hand"), partners(scene, "table")) == (links, set())
+        release(scene)
+        assert (partners(scene, "hand"), partners(scene, "table")) == (links, {"table"})
+
+    alone = build_object_scene(cube, config.physics)
+    assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})
+    reset_object(alone, X_WO)
+    assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})

@@ -177,3 +177,14 @@ def test_hand_and_object_on_the_table_are_told_apart(scene: Scene, cube: ObjectM
     reset_attempt(scene, X_WO, X_WT @ X_TG, spread=0.0, closing=np.full(3, 1.3))
     presses = read_contacts(scene)
     assert (presses.object_on_table, presses.hand_on_table) == (False, True)
+
+
+def test_patch_over_the_border_is_the_fingertips(closed):
+    """As a whole, where most of it is on the pad or its band: nothing of it changes."""
+    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
+    x = _contact_in_link(closed, whole)
+    part = with_pads(closed, ((1.0, 0.0, 0.0, x + 0.5 * PAD_BAND),), EVERYWHERE, EVERYWHERE)
+    assert part.other_links == 0
+    assert np.array_equal(part.f_Q_O, whole.f_Q_O)
+    assert np.array_equal(part.p_OQ, whole.p_OQ)
+    assert np.array_equal(part.area, whole.area)

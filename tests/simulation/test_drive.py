@@ -18,6 +18,7 @@ from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.construction import build_scene
@@ -39,10 +40,25 @@ from drakegrasp.simulation.scene import (
     start_limits,
     transfer_state,
 )
-from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: Rounding and the compliance of Drake's joint limits [rad].
 STILL = np.deg2rad(0.02)
+
+
+@pytest.fixture(scope="module")
+def pinch(carton: ObjectModel, config: Config, hand: Hand) -> dict[str, TrialRecord]:
+    """The carton, pinched symmetrically from above, by drive."""
+    scene = build_scene(carton, config.physics, hand)
+    return {
+        drive: run_attempt(
+            scene,
+            standing(carton),
+            from_above(carton, STANDOFF),
+            override_config(config, [f"lift.drive={drive}"]),
+        )
+        for drive in ("worm", "torque", "locked")
+    }
 
 
 def test_worm_needs_a_holding_torque(config: Config, tmp_path: Path) -> None:
@@ -197,3 +213,12 @@ def _pushed(scene: Scene, force: float, *, steps: int) -> np.ndarray:
     applied.F_Bq_W = SpatialForce(np.zeros(3), np.zeros(3))
     scene.plant.get_applied_spatial_force_input_port().FixValue(scene.context, [applied])
     return np.array(angles)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("drive", ["worm", "locked"])
+def test_pinched_carton_stays_where_it_is(pinch: dict[str, TrialRecord], drive: str) -> None:
+    held = pinch[drive]
+    assert held.outcome is Outcome.SUCCESS
+    assert held.lift.slip < 1e-3
+    assert held.lift.turn < np.deg2rad(1.0)

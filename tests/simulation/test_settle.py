@@ -2,25 +2,49 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from helpers.meshes import G3DB, needs_g3db
 from hypothesis import Phase, assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError
+from drakegrasp.frames import X_WT
 from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.objects.model import ObjectModel, make_object
+from drakegrasp.mesh.surfaces import half_edges, signed_volume
+from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
+from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation import settle as settle_module
-from drakegrasp.simulation.scene import ObjectScene
+from drakegrasp.simulation.construction import build_object_scene
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 from drakegrasp.simulation.settle import Resting, settle
 
 pytestmark = pytest.mark.sim
+
+
+#: Boxes of twelve triangles [mm].
+BOXES = [
+    (60, 80, 100),
+    (60, 90, 200),
+    (60, 60, 100),
+    (50, 50, 150),
+    (100, 100, 100),
+    (200, 30, 60),
+    (40, 120, 160),
+]
+SHAPES = {
+    **{"x".join(map(str, mm)): trimesh.creation.box(np.array(mm) / 1e3) for mm in BOXES},
+    "cylinder": trimesh.creation.cylinder(radius=0.03, height=0.12, sections=16),
+    "cone": trimesh.creation.cone(radius=0.04, height=0.10, sections=16),
+}
 
 
 def as_dropped(mesh: trimesh.Trimesh) -> ObjectModel:
@@ -191,3 +215,52 @@ def test_rest_begins_again_when_the_object_moves_again(
     monkeypatch.setattr(settle_module, "_speeds", look)
     assert settle_module._wait_for_rest(scene, rules) is False
     np.testing.assert_allclose(seen, 0.05 * np.arange(1, checks + 1))
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_trial_keeps_standing_what_rests(name: str, config: Config):
+    """On the surface and with the step of a trial, also what falls 2 cm."""
+    model = as_dropped(SHAPES[name])
+    X_TO = settle(model, config).X_TO.copy()
+    X_TO[2, 3] += 0.02
+    scene = build_object_scene(model, config.physics)
+    reset_object(scene, X_WT @ X_TO)
+    for _ in range(3):
+        advance(scene, 0.4)
+        R_WO = scene.pose(scene.object)[:3, :3]
+        assert np.degrees(np.arccos(np.clip(R_WO[2, 2], -1.0, 1.0))) < 0.5
+        assert settle_module._sink(scene) < 3e-4
+
+
+def test_surface_that_lands_is_the_collision_mesh_without_long_edges(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+):
+    """Not its hull, on which some objects rest otherwise."""
+    built, build = [], settle_module.build_object_scene
+
+    def watch(*args: Any, **kwargs: Any) -> ObjectScene:
+        built.append(kwargs["resting_surface"])
+        return build(*args, **kwargs)
+
+    monkeypatch.setattr(settle_module, "build_object_scene", watch)
+    ring = trimesh.creation.annulus(r_min=0.03, r_max=0.06, height=0.05, sections=16)
+    settle(as_dropped(ring), config)
+    (landed,) = built
+    a, b = landed.vertices[half_edges(landed.faces)].swapaxes(0, 1)
+    assert norm(b - a).max() <= 0.02 * (1.0 + 1e-6)
+    assert signed_volume(landed.vertices, landed.faces) == pytest.approx(ring.volume, rel=1e-6)
+
+
+@pytest.mark.nightly
+@needs_g3db
+@pytest.mark.slow
+def test_real_meshes_do_not_sink_into_the_table(config: Config):
+    sinks = {}
+    for source in find_meshes(Path(G3DB), units="cm")[::2]:
+        try:
+            model = prepare_object(source, config.objects)
+        except MeshError:
+            continue  # in another unit
+        sinks[source.name] = settle(model, config).sink
+    assert len(sinks) >= 14
+    assert max(sinks.values()) < 3e-4
