@@ -37,6 +37,7 @@ NOT_RUN = {
     "dask ": "a cluster; tests/cluster starts one",
     "drakegrasp submit ": "a cluster; tests/cluster/test_submit.py",
     "python pipelines/make_certificates.py ": "a cluster; tests/cluster/test_submit.py",
+    "name=": "a variable of the lines below it",
     "tls=": "options of the lines below it",
     "python pipelines/baseline/": "trains with torch; tests/test_baseline.py",
     "drakegrasp scenes ": "renders for minutes; tests/generation/test_make_scenes.py",

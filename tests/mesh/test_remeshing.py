@@ -120,7 +120,6 @@ RADIUS = 0.05
 @pytest.fixture
 def few_faces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remeshing, "MOST_FACES", 3_000)
-    monkeypatch.setattr(remeshing, "MOST_DECIMATED", 6_000)
 
 
 def ball(subdivisions: int, radius: float = RADIUS) -> trimesh.Trimesh:

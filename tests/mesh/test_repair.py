@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers.mesh_files import load_mesh
 from helpers.meshes import (
     BOX,
     G3DB,
@@ -23,7 +24,6 @@ import drakegrasp.mesh.repair
 import drakegrasp.mesh.union
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.components import part_touching_edges
-from drakegrasp.mesh.loading import load_mesh
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     is_solid_surface,

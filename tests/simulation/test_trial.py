@@ -420,3 +420,86 @@ def test_limit_is_of_the_threads_own_computing_time(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(stepping, "time", SimpleNamespace(thread_time=lambda: 5.0, **others))
     limits = stepping.start_limits(load_config(overrides=["attempt_seconds=3"]))
     assert limits.deadline == pytest.approx(8.0)
+
+
+def test_hand_inside_of_a_ring_does_not_collide(tmp_path, config, hand):
+    """The object's surface counts, not its convex hull."""
+    ring = model_of(
+        trimesh.creation.annulus(r_min=0.28, r_max=0.30, height=0.04, sections=64), tmp_path
+    )
+    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.15])
+    attempt = Attempt(X_OG=X_OG, spread=0.0)
+    scene = build_scene(ring, config.physics, hand)
+    everything = override_config(config, ["screen.mode=off"])
+    record = run_attempt(scene, standing(ring), attempt, everything)
+    assert record.outcome is Outcome.MISSING_FINGERTIP
+    assert run_attempt(scene, standing(ring), attempt, config).outcome is Outcome.SCREENED
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (-0.7, 0.7)])
+def test_a_block_sinks_into_the_table_alike_everywhere(tmp_path, place):
+    """On a soft table of modulus E, a base A is where E d A / 0.05 m carries the weight."""
+    model = box_model(tmp_path, [0.08, 0.08, 0.04])
+    physics = load_config(overrides=["physics.table_modulus=1e5"]).physics
+    scene = build_object_scene(model, physics)
+    X_WO = X_WT @ standing(model)
+    X_WO[:2, 3] += place
+    reset_object(scene, X_WO)
+    scene.simulator.Initialize()
+    advance(scene, 1.0)
+    depth = X_WO[2, 3] - scene.pose(scene.object)[2, 3]
+    assert depth == pytest.approx(model.mass * GRAVITY * 0.05 / (1e5 * 0.08**2), rel=0.02)
+
+
+def test_table_friction_stops_a_sliding_block(tmp_path):
+    """A block of speed v slides v^2 / (2 mu g) before it stops.
+
+    The table is stiff: at 1 ms the distance is two tenths short, at 0.2 ms less than one.
+    """
+    model = box_model(tmp_path, [0.08, 0.08, 0.04])
+    physics = load_config(
+        overrides=["physics.friction_table=0.5", "physics.time_step=0.0002"]
+    ).physics
+    slid = {}
+    for start, x in ((0.5, 0.0), (0.5, 0.3), (1.0, 0.0)):
+        scene = build_object_scene(model, physics)
+        X_WO = X_WT @ standing(model)
+        X_WO[0, 3] += x
+        reset_object(scene, X_WO)
+        scene.simulator.Initialize()
+        advance(scene, 0.1)
+        velocity = np.zeros(6)
+        velocity[3] = start
+        scene.plant.SetVelocities(scene.context, velocity)
+        before = scene.pose(scene.object)[0, 3]
+        advance(scene, 0.3)
+        assert np.abs(scene.plant.GetVelocities(scene.context)).max() < 1e-3
+        slid[start, x] = scene.pose(scene.object)[0, 3] - before
+        assert slid[start, x] == pytest.approx(start**2 / (2.0 * 0.5 * GRAVITY), rel=0.1)
+    # No border of the table's parts is where objects stand.
+    assert slid[0.5, 0.3] == pytest.approx(slid[0.5, 0.0], rel=1e-3)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand):
+    """At the default of 8 ms 95 % of what is simulated ends as at 1 ms."""
+    model = box_model(tmp_path, [0.05, 0.07, 0.15], name="1_box_tall")
+    X_TO, coarse = standing(model), override_config(config, ["screen.mode=off"])
+    fine = override_config(coarse, ["physics.time_step=0.001", "physics.coarse_steps=1"])
+    scenes = [build_scene(model, rule.physics, hand) for rule in (coarse, fine)]
+
+    # Take attempts from the draw until there are 20 to compare, and three successes among them.
+    same: list[bool] = []
+    successes = 0
+    for attempt in drawn_attempts(model, X_TO, config):
+        record = run_attempt(scenes[0], X_TO, attempt, coarse)
+        if record.closed is not None:
+            truth = run_attempt(scenes[1], X_TO, attempt, fine).outcome
+            same.append(record.outcome is truth)
+            successes += truth is Outcome.SUCCESS
+        if len(same) >= 20 and successes >= 3:
+            break
+    assert len(same) >= 20
+    assert successes >= 3
+    assert np.mean(same) >= 0.95
