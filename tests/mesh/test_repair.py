@@ -155,31 +155,6 @@ def test_seam_that_does_not_quite_meet_is_stitched(tmp_path):
     assert "stitched" in model.notes[0]
 
 
-def test_a_body_through_itself_counts_once(tmp_path):
-    # A bent bar as one surface whose ends cross, like a pretzel.
-    path = np.array([[0, 0, 0], [0.2, 0, 0], [0.2, 0.15, 0], [0.1, 0.15, 0], [0.1, -0.1, 0.0]])
-    square = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.01
-    rings = []
-    for i, point in enumerate(path):
-        before = point - path[i - 1] if i else path[1] - path[0]
-        after = path[i + 1] - point if i < len(path) - 1 else before
-        side = sum(np.cross(d / np.linalg.norm(d), [0, 0, 1.0]) for d in (before, after))
-        side = side / (1.0 if np.dot(before, after) == 0 else 2.0)
-        rings.append(point + square[:, :1] * side + square[:, 1:] * [0, 0, 1.0])
-    faces = [[0, 1, 2], [0, 2, 3]]
-    for i in range(len(path) - 1):
-        for j in range(4):
-            a, b, c, d = 4 * i + j, 4 * i + (j + 1) % 4, 4 * i + 4 + j, 4 * i + 4 + (j + 1) % 4
-            faces += [[a, d, b], [a, c, d]]
-    end = 4 * (len(path) - 1)
-    faces += [[end, end + 2, end + 1], [end, end + 3, end + 2]]
-    bar = trimesh.Trimesh(np.vstack(rings), faces, process=False)
-    model = prepare(write(tmp_path / "a.obj", bar))
-    assert_sound(model)
-    assert model.volume == pytest.approx(abs(bar.volume) - 0.02**3, rel=2e-3)
-    assert any("which now counts once" in note for note in model.notes)
-
-
 def test_winding_numbers_of_a_box():
     cube = box()
     points = np.array([[0.0, 0.0, 0.0], [0.029, 0.049, 0.019], [0.031, 0.0, 0.0], [5.0, 5.0, 5.0]])
@@ -258,38 +233,6 @@ def test_touching_edge_gets_a_vertex_for_each_side():
     assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
 
 
-@pytest.mark.parametrize("limit", ["WELD_PART", "MOST_PACKED"])
-def test_welding_in_parts_changes_no_bit(monkeypatch, limit):
-    """A soup as in an STL file: each corner has a vertex of its own, some faces come twice."""
-    ball = trimesh.creation.icosphere(2, radius=0.05)
-    rng = np.random.default_rng(0)
-    order = np.append(rng.permutation(len(ball.faces)), [3, 3, 7])
-    soup = ball.vertices[ball.faces[order]].reshape(-1, 3)
-    soup += rng.uniform(-1e-11, 1e-11, soup.shape)
-    faces = np.arange(len(soup)).reshape(-1, 3)
-    whole = weld(soup, faces)
-    assert (len(whole[0]), len(whole[1])) == (len(ball.vertices), len(ball.faces))
-    monkeypatch.setattr(drakegrasp.mesh.repair, limit, 50)
-    parts = weld(soup, faces)
-    for one, other in zip(whole, parts, strict=True):
-        np.testing.assert_array_equal(one, other)
-        assert one.dtype == other.dtype
-
-
-def test_share_of_a_solid_that_changed_is_of_its_volume():
-    """A quarter of a box far from the origin is cut off."""
-    low, size = np.array([0.3, -0.7, 0.2]), np.array([0.1, 0.2, 0.4])
-
-    def share(height: float) -> float:
-        solid = trimesh.creation.box(bounds=[low, low + size * [1.0, 1.0, height]])
-        whole = trimesh.creation.box(bounds=[low, low + size])
-        candidate = solid.vertices, solid.faces
-        return drakegrasp.mesh.union._changed_share(candidate, whole.vertices, whole.faces)
-
-    assert share(1.0) == 0.0
-    assert share(0.75) == pytest.approx(0.25, abs=0.01)
-
-
 def test_triangle_that_is_a_needle_is_collapsed_and_told():
     """An edge of a box is parted a nanometre from its end, in both faces beside it."""
     solid = trimesh.creation.box([0.1, 0.2, 0.4])
@@ -314,14 +257,13 @@ def test_triangle_that_is_a_needle_is_collapsed_and_told():
     ("share", "said"), [(0.0015, "kept"), (0.03, "noted"), (0.045, "noted"), (0.055, "refused")]
 )
 def test_what_passes_through_itself_is_kept_noted_or_refused(share, said, monkeypatch):
-    """By the share of its volume that is enclosed twice; untangling finds nothing better."""
+    """By the share of its volume that is enclosed twice."""
     monkeypatch.setattr(drakegrasp.mesh.union, "overlap_share", lambda *_, **__: share)
-    monkeypatch.setattr(drakegrasp.mesh.union, "_untangle", lambda solid, _: [solid])
     box, notes = trimesh.creation.box([0.1, 0.2, 0.4]), []
     surface = np.asarray(box.vertices), np.asarray(box.faces)
     if said == "refused":
         with pytest.raises(MeshError, match=r"must not pass through itself, got 5\.5%"):
-            drakegrasp.mesh.union.separate(*surface, notes)
+            drakegrasp.mesh.union.refuse_overlap(*surface, notes)
         return
-    drakegrasp.mesh.union.separate(*surface, notes)
-    assert any("still passes" in note for note in notes) is (said == "noted")
+    drakegrasp.mesh.union.refuse_overlap(*surface, notes)
+    assert any("passes through" in note for note in notes) is (said == "noted")
