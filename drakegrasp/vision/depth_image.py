@@ -1,7 +1,7 @@
 """Depth images of a user's own camera: the points of an object, and the table below it.
 
 Input: a depth image in metres, the camera matrix, and a mask of the object. Output: points in {T},
-for `scoring.network` and `scoring.ranking`. The pose of the camera over the table is known, or it
+for `scoring.proposals` and `scoring.ranking`. The pose of the camera over the table is known, or it
 follows from the plane on which the object stands. Pixels without a depth (0, NaN or infinite) are
 left out. Image files and camera files are read here too.
 """
