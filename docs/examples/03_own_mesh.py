@@ -46,7 +46,7 @@ def main() -> None:
 
     # The neck from above, with the contacts that were asked for and those that the hand made.
     reached = verdict.trial.closed.contacts.p_OQ
-    figure, axes = plt.subplots(figsize=(4.0, 4.0))
+    figure, axes = plt.subplots(figsize=(4.5, 4.0), layout="tight")
     axes.plot(*(1e3 * vase.model.visual_vertices[:, :2]).T, ".", color="lightgrey", markersize=2)
     axes.plot(*(1e3 * p_OQ[:, :2]).T, "o", label="requested")
     axes.plot(*(1e3 * reached[:, :2]).T, "x", label="reached")
