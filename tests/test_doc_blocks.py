@@ -37,7 +37,6 @@ NOT_RUN = {
     "dask ": "a cluster; tests/cluster starts one",
     "drakegrasp submit ": "a cluster; tests/cluster/test_submit.py",
     "python pipelines/make_certificates.py ": "a cluster; tests/cluster/test_submit.py",
-    "name=": "a variable of the lines below it",
     "tls=": "options of the lines below it",
     "python pipelines/baseline/": "trains with torch; tests/test_baseline.py",
     "drakegrasp scenes ": "renders for minutes; tests/generation/test_make_scenes.py",
@@ -77,6 +76,7 @@ NO_CODE = {
 #: Blocks marked `py`: Python that is not run as it stands, by a part of it, and why.
 PY_NOT_RUN = {
     "dg.fit_table(": "wants a depth image; tests/vision/test_depth_image.py",
+    "simulate=5, view=view": "wants a depth image; tests/scoring/test_predicting.py",
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     "read_closed_grasps(out)": "an exporter of the reader; tests/test_plugin.py",
     "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",

@@ -257,7 +257,7 @@ def test_bar_counts_the_samples_of_a_target(whole: Path) -> None:
         manifest,
         target,
         None,
-        lambda done, total, *, found, **figures: shown.append((done, total, figures)),
+        lambda done, total, **figures: shown.append((done, total, figures)),
     )
     by_object = {
         entry.name: [unit for unit in manifest.headers() if unit.object_name == entry.name]
