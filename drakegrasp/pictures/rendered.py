@@ -91,7 +91,7 @@ def picture_hand(hand: Hand, png: Path, *, across: float) -> None:
         axes = add_axes(figure, 0.1 + i * (INCHES + 0.1), 0.3, INCHES, INCHES)
         scene.pose(Poses(X_WG=np.eye(4), q=q))
         picture = scene.picture(X_WC, (HAND_PIXELS, HAND_PIXELS), LIGHTING)
-        axes.imshow(picture.image, interpolation="antialiased")
+        axes.imshow(picture, interpolation="antialiased")
         axes.set_title(title, fontsize=9, color=INK, pad=4.0)
         hide_ticks(axes)
     entries = [(f"pad of {finger.name}", _colour(i)) for i, finger in enumerate(hand.fingers)]

@@ -1,8 +1,6 @@
-"""A still scene: a hand, by itself or with an object on a table, posed and drawn.
+"""A still scene: a hand, posed and drawn.
 
-Input: a hand, an object's model if there is one, and `Poses`. Output: poses of the links,
-and pictures with their cameras, so that frames and contacts can be drawn over them.
-Nothing is simulated.
+Input: a hand, and `Poses`. Output: poses of the links, and pictures. Nothing is simulated.
 
 For the 3D view of a browser, links and objects are JSON: a list of parts, each with its `colour`
 "#rrggbb", `vertices` (n, 3) as float32 [m] and `faces` (m, 3) as uint32, both little-endian in
@@ -17,7 +15,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,31 +47,23 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from drakegrasp.errors import MachineError, MeshError
-from drakegrasp.frames import X_WT, Array, make_pose, transform_points
+from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.loading import load_surface
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import prepare_rendering
-from drakegrasp.vision.camera import Picture, object_colour
-from drakegrasp.vision.rendering import BLANK, GREY, add_drawn_object, add_posed_hand
+from drakegrasp.vision.camera import object_colour
+from drakegrasp.vision.rendering import BLANK, GREY, add_posed_hand
 
 #: Vertical field of view [deg]: narrow, so that perspective distorts little.
 FOV_Y_DEG = 26.0
-#: Viewpoints that `choose_view` tries: azimuths, and elevations above the horizontal [deg].
-AZIMUTHS_DEG, ELEVATIONS_DEG = range(0, 360, 20), (19.0, 28.0)
-#: Edge of the label images with which viewpoints are compared [px].
-TRIAL_SIZE = 120
 #: Pictures are rendered larger by this factor and averaged, since VTK alone leaves jagged edges.
 OVERSAMPLING = 2
 #: Margin around the origins of the hand's links for the links' own size [m].
 MARGIN = 0.035
 BACKGROUND = np.array([0.95, 0.96, 0.97])
-TABLE_COLOUR = np.array([0.74, 0.70, 0.64, 1.0])
-TABLE_SIZE, TABLE_THICKNESS = 1.6, 0.1
-#: Edge of the shadow map [px].
-SHADOW_MAP = 4096
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,57 +72,36 @@ class Lighting:
 
     Attributes:
         name: Unique name of the lighting, also of Drake's render engine with these lights.
-        lights: Lights; in camera axes +X is right and +Y down. Only spot lights cast shadows.
+        lights: Lights; in camera axes +X is right and +Y down.
     """
 
     name: str
     lights: Sequence[LightParameter]
 
 
-#: For pictures of hand and object together.
-SHADOWS = Lighting(
-    name="shadows",
-    lights=(
-        LightParameter(type="point", frame="camera", position=[0.3, -0.3, -0.5], intensity=0.5),
-        LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.25),
-        LightParameter(
-            type="spot",
-            frame="camera",
-            position=[-1.0, -1.3, 0.2],
-            direction=[1.0, 1.3, 1.0],
-            intensity=0.7,
-            cone_angle=26.0,
-        ),
-    ),
-)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Poses:
-    """Poses of hand and object.
+    """Poses of a hand.
 
     Attributes:
         X_WG: (4, 4), pose of the palm.
         q: (j,), positions of the hand's joints [rad or m], in the order of the dataset's files.
-        X_WO: (4, 4), pose of the object; ignored in a scene without one.
     """
 
     X_WG: Array
     q: npt.ArrayLike
-    X_WO: Array = field(default_factory=lambda: np.eye(4))
 
 
 class StillScene:
-    """A hand in Drake, by itself or with an object on a table. Not thread-safe.
+    """A hand in Drake. Not thread-safe.
 
     Args:
         hand: The hand.
-        model: The object; without one there is no table.
         add: Function that adds more shapes to the plant, before it is finalized, and to the hand's
             model instance in it.
 
     Attributes:
-        hand, model: The arguments.
+        hand: The hand.
         joints: Names of the hand's joints, in the order of the dataset's files.
         links: Names of the hand's links.
     """
@@ -140,21 +109,12 @@ class StillScene:
     def __init__(
         self,
         hand: Hand,
-        model: ObjectModel | None = None,
         *,
         add: Callable[[MultibodyPlant, ModelInstanceIndex], None] | None = None,
     ) -> None:
-        # The object, above a table.
+        # The hand, whose palm can be placed anywhere.
         builder = DiagramBuilder()
         plant, graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
-        self._object: RigidBody | None = None
-        if model is not None:
-            self._object = add_drawn_object(plant, model)
-            X_WB = RigidTransform(X_WT @ make_pose(np.eye(3), [0.0, 0.0, -TABLE_THICKNESS / 2.0]))
-            slab = Box(TABLE_SIZE, TABLE_SIZE, TABLE_THICKNESS)
-            plant.RegisterVisualGeometry(plant.world_body(), X_WB, slab, "table", TABLE_COLOUR)
-
-        # The hand, whose palm can be placed anywhere.
         instance, self._wrist = add_posed_hand(plant, hand)
         if add is not None:
             add(plant, instance)
@@ -165,7 +125,7 @@ class StillScene:
         self._root = self._diagram.CreateDefaultContext()
         self._plant, self._graph, self._instance = plant, graph, instance
         self._context = plant.GetMyMutableContextFromRoot(self._root)
-        self.hand, self.model = hand, model
+        self.hand = hand
         self.joints: tuple[str, ...] = tuple(plant.GetPositionNames(instance, False, False))
         self.links = tuple(plant.get_body(i).name() for i in plant.GetBodyIndices(instance))
 
@@ -181,11 +141,9 @@ class StillScene:
         return np.array([named[name] for name in self.joints])
 
     def pose(self, poses: Poses) -> None:
-        """Move hand and object to poses."""
+        """Move the hand."""
         self._wrist.SetPoseInParentFrame(self._context, RigidTransform(poses.X_WG))
         self._plant.SetPositions(self._context, self._instance, np.asarray(poses.q, dtype=float))
-        if self._object is not None:
-            self._plant.SetFreeBodyPose(self._context, self._object, RigidTransform(poses.X_WO))
 
     def link_pose(self, link: str) -> Array:
         """Return the pose X_WL (4, 4) of a link of the hand."""
@@ -201,8 +159,10 @@ class StillScene:
         shapes = shapes or self._plant.GetCollisionGeometriesForBody(body)
         return self._graph.model_inspector(), list(shapes)
 
-    def picture(self, X_WC: Array, size: tuple[int, int], lighting: Lighting = SHADOWS) -> Picture:
-        """Return the picture of a camera.
+    def picture(
+        self, X_WC: Array, size: tuple[int, int], lighting: Lighting
+    ) -> npt.NDArray[np.uint8]:
+        """Return the picture (height, width, 3) of a camera.
 
         Args:
             X_WC: (4, 4), pose of the camera.
@@ -219,59 +179,7 @@ class StillScene:
         if not large.any():
             raise MachineError(BLANK)
         blocks = large[:, :, :3].reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3)
-        image = np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
-
-        # The camera matrix of the averaged picture.
-        focal = height / (2.0 * np.tan(np.deg2rad(FOV_Y_DEG) / 2.0))
-        K = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0, 0, 1.0]])
-        return Picture(image=image, K=K, X_WC=X_WC)
-
-    def seen(self, X_WC: Array, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-        """Return which pixels show each fingertip, and which show the object if there is one.
-
-        Args:
-            X_WC: (4, 4), pose of the camera.
-            size: Width and height of the image [px].
-
-        Returns:
-            (k, height, width) without an object, else (k + 1, height, width), the object last.
-        """
-        camera = self._camera(size, SHADOWS)
-        labels = self._query().RenderLabelImage(camera, self._world(), RigidTransform(X_WC)).data
-        bodies = [self._body(link) for link in self.hand.fingertip_links]
-        bodies += [] if self._object is None else [self._object]
-        return np.stack([labels[:, :, 0] == int(body.index()) for body in bodies])
-
-    def choose_view(self, p_WA: Array) -> Array:
-        """Return the pose X_WC (4, 4) of a camera that sees given points and all fingertips.
-
-        A ring of viewpoints is tried. The best viewpoint is the one whose least visible fingertip
-        covers the most pixels; among equal ones, the one with the most pixels of fingertips and
-        object.
-
-        Args:
-            p_WA: (n, 3), points that must be in the picture [m].
-        """
-        best, most = np.eye(4), (-1, -1)
-        for elevation in np.deg2rad(ELEVATIONS_DEG):
-            for azimuth in np.deg2rad(AZIMUTHS_DEG):
-                X_WC = camera_pose(p_WA, azimuth, elevation)
-                pixels = self.seen(X_WC, (TRIAL_SIZE, TRIAL_SIZE)).sum(axis=(1, 2))
-                score = int(pixels[: self.hand.num_fingers].min()), int(pixels.sum())
-                if score > most:
-                    best, most = X_WC, score
-        return best
-
-    def outline(self, poses: Poses) -> Array:
-        """Pose the scene, and return points (n, 3) in {W} that a picture must contain [m].
-
-        They are the origins of the hand's links, and the corners of the object's bounding box.
-        """
-        self.pose(poses)
-        points = [self.link_pose(link)[None, :3, 3] for link in self.links]
-        if self.model is not None:
-            points.insert(0, transform_points(poses.X_WO, box_corners(self.model)))
-        return np.vstack(points)
+        return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
     def _body(self, link: str) -> RigidBody:
         return self._plant.GetBodyByName(link, self._instance)
@@ -292,8 +200,6 @@ class StillScene:
                 default_clear_color=BACKGROUND,
                 default_diffuse=GREY,
                 lights=list(lighting.lights),
-                cast_shadows=any(light.type == "spot" for light in lighting.lights),
-                shadow_map_size=SHADOW_MAP,
             )
             self._graph.AddRenderer(context, lighting.name, MakeRenderEngineVtk(parameters))
         info = CameraInfo(*size, np.deg2rad(FOV_Y_DEG))
@@ -327,12 +233,6 @@ def camera_pose(p_WA: Array, azimuth: float, elevation: float, *, fill: float = 
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
     return make_pose(np.column_stack([x, np.cross(z, x), z]), middle - distance * z)
-
-
-def box_corners(model: ObjectModel) -> Array:
-    """Return the corners (8, 3) of an object's bounding box, in {O} [m]."""
-    signs = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
-    return np.asarray(model.half_extents * signs)
 
 
 def object_json(model: ObjectModel) -> bytes:

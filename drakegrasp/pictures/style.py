@@ -280,10 +280,3 @@ def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:
     buffer = io.BytesIO()
     imsave(buffer, colours, format="png")
     return buffer.getvalue()
-
-
-def show_image(axes: Axes, image: npt.NDArray[np.uint8]) -> None:
-    """Show an image with integer coordinates at the pixel centres."""
-    axes.imshow(image, interpolation="antialiased")
-    frame_image(axes, *image.shape[:2])
-    axes.set_autoscale_on(False)

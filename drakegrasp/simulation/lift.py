@@ -13,9 +13,6 @@ time without changing the verdict:
 With `lift.stop_when: lost_sample`, a lift also ends, without a verdict, at the first check at which
 the object has moved more in the hand than a sample may. If the verdict is certain at that check, or
 at the end, the verdict takes precedence.
-
-`LiftPath` is the path of an object without a hand, for the wrenches on it: a straight minimum-jerk
-motion (Flash and Hogan, 1985) at constant orientation, within the limits of the palm.
 """
 
 from __future__ import annotations
@@ -23,7 +20,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
@@ -272,58 +268,6 @@ def _motion(X_GO_before: Array, X_GO: Array) -> tuple[float, float]:
 PEAK_SPEED = 15.0 / 8.0
 #: Peak acceleration of a minimum-jerk motion, times duration squared, divided by distance.
 PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LiftPath:
-    """A straight motion of an object at constant orientation.
-
-    Attributes:
-        X_WO: Pose at the start, (4, 4).
-        p_WO_end: Position of {O} at the end, (3,) [m].
-        duration: Duration of the motion [s], positive; the object stays at the end afterwards.
-    """
-
-    X_WO: Array
-    p_WO_end: Array
-    duration: float
-
-    @property
-    def R_WO(self) -> Array:
-        """Orientation, (3, 3)."""
-        return self.X_WO[:3, :3]
-
-    def at(self, time: float) -> tuple[Array, Array, Array]:
-        """Return position [m], velocity [m/s] and acceleration [m/s^2] of {O} at a time [s].
-
-        With s = t / T from 0 to 1 over the duration T, and the whole path d (Flash and Hogan,
-        1985):
-
-            p = p₀ + d (10 s³ − 15 s⁴ + 6 s⁵)
-            v = d 30 s² (1 − s)² / T
-            a = d 60 s (1 − s) (1 − 2 s) / T²
-        """
-        s = min(time / self.duration, 1.0)
-        start = self.X_WO[:3, 3]
-        shift = self.p_WO_end - start
-        return (
-            start + shift * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
-            shift * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
-            shift * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
-        )
-
-
-def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
-    """Return the path from a resting pose (4, 4) to p_TO = `lift.p_TG`.
-
-    Without a hand, the object's origin moves to the target of the palm.
-    """
-    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
-    p_WO_end = X_WT[:3, 3] + config.lift.p_TG
-    duration = lift_duration(float(np.linalg.norm(p_WO_end - X_WO[:3, 3])), config)
-    # The object may start at its target.
-    duration = max(duration, config.physics.time_step)
-    return LiftPath(X_WO=X_WO, p_WO_end=p_WO_end, duration=duration)
 
 
 def lift_duration(distance: float, config: Config) -> float:

@@ -192,25 +192,6 @@ def _principal_axis(centred: Array) -> Array:
     return np.asarray(axis / size) if size > 0.0 else np.array([1.0, 0.0])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Picture:
-    """An image and the camera that took it.
-
-    Attributes:
-        image: (height, width, 3) uint8.
-        K: Camera matrix (3, 3) [px].
-        X_WC: Pose of the camera (4, 4).
-    """
-
-    image: npt.NDArray[np.uint8]
-    K: Array
-    X_WC: Array
-
-    def pixels(self, p_WA: npt.ArrayLike) -> Array:
-        """Return the pixel coordinates (n, 2) [px] of points (n, 3) of the world [m]."""
-        return project(self.K, transform_points(invert_pose(self.X_WC), p_WA))
-
-
 # Visibility of contacts, cameras of scenes, and appearance of a scene
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 from mujoco_drive import FingerDrive
 from mujoco_scene import IMMOVABLE, build_mujoco_scene
 
@@ -27,7 +28,7 @@ from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.contacts import MAX_BESIDE
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.lift import lift_path
+from drakegrasp.simulation.lift import lift_duration
 from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
 #: Time steps between two checks while closing, and while lifting.
@@ -306,3 +307,50 @@ class MujocoBaseline:
         R_WF = self._data.xmat[link].reshape(3, 3)
         finger = self._hand.fingers[self._tips.index(link)]
         return bool(finger.on_pad((p_WQ - self._data.xpos[link]) @ R_WF))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LiftPath:
+    """A straight motion of an object at constant orientation.
+
+    Attributes:
+        X_WO: Pose at the start, (4, 4).
+        p_WO_end: Position of {O} at the end, (3,) [m].
+        duration: Duration of the motion [s], positive; the object stays at the end afterwards.
+    """
+
+    X_WO: Array
+    p_WO_end: Array
+    duration: float
+
+    def at(self, time: float) -> tuple[Array, Array, Array]:
+        """Return position [m], velocity [m/s] and acceleration [m/s^2] of {O} at a time [s].
+
+        With s = t / T from 0 to 1 over the duration T, and the whole path d (Flash and Hogan,
+        1985):
+
+            p = p₀ + d (10 s³ − 15 s⁴ + 6 s⁵)
+            v = d 30 s² (1 − s)² / T
+            a = d 60 s (1 − s) (1 − 2 s) / T²
+        """
+        s = min(time / self.duration, 1.0)
+        start = self.X_WO[:3, 3]
+        shift = self.p_WO_end - start
+        return (
+            start + shift * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
+            shift * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
+            shift * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
+        )
+
+
+def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
+    """Return the path from a resting pose (4, 4) to p_TO = `lift.p_TG`.
+
+    Without a hand, the object's origin moves to the target of the palm.
+    """
+    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+    p_WO_end = X_WT[:3, 3] + config.lift.p_TG
+    duration = lift_duration(float(np.linalg.norm(p_WO_end - X_WO[:3, 3])), config)
+    # The object may start at its target.
+    duration = max(duration, config.physics.time_step)
+    return LiftPath(X_WO=X_WO, p_WO_end=p_WO_end, duration=duration)

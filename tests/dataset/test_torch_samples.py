@@ -127,11 +127,11 @@ def test_a_process_that_has_rendered_can_train() -> None:
     code = """
 import numpy as np, torch
 from drakegrasp.hand.description import load_hand
-from drakegrasp.pictures.still_scene import Poses, StillScene, camera_pose
+from drakegrasp.pictures.rendered import LIGHTING
+from drakegrasp.pictures.still_scene import StillScene, camera_pose
 
 scene = StillScene(load_hand())
-p_WA = scene.outline(Poses(X_WG=np.eye(4), q=scene.positions(0.0)))
-scene.picture(camera_pose(p_WA, 0.3, 0.4), (60, 60))
+scene.picture(camera_pose(0.1 * np.eye(3), 0.3, 0.4), (60, 60), LIGHTING)
 torch.optim.Adam(torch.nn.Linear(2, 1).parameters())
 """
     # In a process of its own, because the fault would be a segmentation fault.

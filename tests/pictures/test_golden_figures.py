@@ -17,7 +17,6 @@ from drakegrasp.pictures import figures, rendered
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 from drakegrasp.pictures.rendered import picture_hand
 from drakegrasp.pictures.still_scene import StillScene, camera_pose
-from drakegrasp.vision.camera import Picture
 
 
 @pytest.fixture
@@ -61,10 +60,10 @@ def test_hand_with_its_pads_and_frames(
     """The palm's axes and those of other tools, pads, and three panels from one camera."""
     lines: list[str] = []
 
-    def picture(scene: StillScene, X_WC: Array, size: tuple[int, int], *_: object) -> Picture:
+    def picture(scene: StillScene, X_WC: Array, size: tuple[int, int], *_: object) -> np.ndarray:
         lines.extend([] if lines else shapes_of(scene))
         lines.append(f"panel {size} {points(X_WC)} {points(scene.link_pose(scene.links[-1]))}")
-        return Picture(image=np.zeros((2, 2, 3), np.uint8), K=np.eye(3), X_WC=X_WC)
+        return np.zeros((2, 2, 3), np.uint8)
 
     monkeypatch.setattr(StillScene, "picture", picture)
 

@@ -10,15 +10,12 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from helpers.machine import needs_egl
 from matplotlib.figure import Figure
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import create_field
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
-from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
@@ -146,38 +143,6 @@ def test_examples_of_the_docs_run(
     np.testing.assert_allclose(space["p_LQ"], P_CQ * [1.0, -1.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(space["X_TL"][:3, 2], [0.0, 0.0, 1.0], atol=1e-6)
     assert f"f = {K[0, 0]:.2f} px, c = {K[0, 2]:.1f} px" in text
-
-
-@pytest.mark.sim
-@needs_egl
-def test_chosen_view_sees_every_fingertip(sound: Path) -> None:
-    from drakegrasp.frames import X_WT, unpack_pose
-    from drakegrasp.hand.description import load_hand
-    from drakegrasp.objects.model import load_object
-    from drakegrasp.pictures.still_scene import Poses, StillScene
-    from drakegrasp.simulation.construction import build_scene
-    from drakegrasp.simulation.scene import hand_joint_names
-
-    row, hand = Trials(sound).trial(0), load_hand()
-    model = load_object(sound / "objects" / f"{row['object_name']}.npz")
-    scene = StillScene(hand, model)
-    # What trials.hdf5 holds is in the order of the simulated scene.
-    built = build_scene(model, read_manifest(sound).config.physics, hand)
-    assert list(scene.joints) == list(hand_joint_names(built))
-    X_WO = X_WT @ unpack_pose(row["X_TO"])
-    closed = Poses(X_WG=X_WO @ unpack_pose(row["X_OG"]), q=row["closed_q"], X_WO=X_WO)
-    body = scene.outline(closed)
-    X_WC = scene.choose_view(body)
-    *tips, box = scene.seen(X_WC, (128, 128))
-    assert [tip.sum() > 30 for tip in tips] == [True] * 3
-    # What is shown is in the picture, and the object where its frame projects to.
-    picture = scene.picture(X_WC, (128, 128))
-    uv = picture.pixels(body)
-    assert np.all((uv >= 0.0) & (uv <= 127.0))
-    rows, columns = np.nonzero(box)
-    top = X_WO[:3, 3] + [0.0, 0.0, model.half_extents[2]]
-    assert abs(picture.pixels(top[None])[0, 1] - rows.min()) < 6.0
-    assert abs(picture.pixels(X_WT[None, :3, 3])[0, 0] - columns.mean()) < 6.0
 
 
 def test_figures_import_no_drake() -> None:
