@@ -46,13 +46,13 @@ LARGEST, SMALLEST = 1e12, 1e-12
 MOST, MOST_SEED = 2**31 - 1, 2**64 - 1
 
 
-def _refuse_tiny(value: float) -> float:
+def _validate_lengths(value: float) -> float:
     if value < SMALLEST:
         raise ValueError(f"must be at least {SMALLEST:g}, got {value}")
     return value
 
 
-def _refuse_millimetres(value: float) -> float:
+def _validate_metres(value: float) -> float:
     if value > 1.0:
         raise ValueError(f"must be at most 1 m, got {value:g} m")
     return value
@@ -60,7 +60,7 @@ def _refuse_millimetres(value: float) -> float:
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[
-    float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False), AfterValidator(_refuse_tiny)
+    float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False), AfterValidator(_validate_lengths)
 ]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=MOST)]
@@ -69,7 +69,7 @@ Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 #: Distances of the palm from the object [m].
 Standoffs = Annotated[
-    tuple[Annotated[Positive, AfterValidator(_refuse_millimetres)], ...], Field(min_length=1)
+    tuple[Annotated[Positive, AfterValidator(_validate_metres)], ...], Field(min_length=1)
 ]
 Angles = Annotated[tuple[Number, ...], Field(min_length=1)]
 #: Identifier of a licence: a line of printable ASCII.
@@ -415,7 +415,7 @@ def _filter_config() -> type[_Filters]:
         kind = _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind]
         settings[name] = (kind, limit.default)
     # User-defined filters: `file.py:Name`, or the name of a rule of another package.
-    own = Annotated[tuple[str, ...], BeforeValidator(partial(_named, "rules"))]
+    own = Annotated[tuple[str, ...], BeforeValidator(partial(_named, "filters"))]
     settings["own"] = (own, ())
     doc = "Which successes become samples, decided when the files are assembled; null: no limit."
     return create_model("FilterConfig", __base__=_Filters, __doc__=doc, **settings)

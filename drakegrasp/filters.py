@@ -1,7 +1,7 @@
 """Which successes become samples: the limits, the reasons, and the rules that apply them.
 
-A filter is a `Rule`: the columns that it needs, and the rows that it rejects. A new filter is one
-entry in `RULES`, with its reason in `Removal` and its limit in `LIMITS`; the configuration, the
+A `Filter` has the columns that it needs, and tells the rows that it rejects. A new filter is one
+entry in `FILTERS`, with its reason in `Removal` and its limit in `LIMITS`; the configuration, the
 writer, verdicts, `check` and the docs follow. A filter removes a grasp from the two data files, but
 never from trials.hdf5. A removal has one reason: the first rule that rejects the grasp. The filters
 of images and contacts are the paper's (Veres et al., "Postprocessing"); the filters of the hold are
@@ -42,7 +42,7 @@ class Removal(IntEnum):
     OUTLIER = 10  # a component of the grasp is too far from the mean of its object's grasps
     REJECTED = 11  # an inspection rejected it; the last of the filters
     # Values are stored in files: a later filter has the next number, which is not its place.
-    SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
+    ANOMALOUS = 12  # the anomaly score or a part of it is too high; before OUTLIER
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first filter
     OWN = 15  # a user-defined filter does not keep it; before OUTLIER
     NEAR_CONE = 16  # a fingertip uses too much of its friction cone; before OUTLIER
@@ -102,7 +102,7 @@ LIMITS = {
         "null",
     ),
     # As thresholds, the score and its parts would also remove good grasps, so they are off.
-    "max_suspicion": Limit(None, "positive", "score of dataset/quality.py", "null"),
+    "max_anomaly": Limit(None, "positive", "score of dataset/quality.py", "null"),
     "max_penetration": Limit(
         None, "positive", "penetration of the object in a fingertip [m]", "null"
     ),
@@ -129,7 +129,7 @@ class Limits(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rule:
+class Filter:
     """A filter.
 
     Attributes:
@@ -164,7 +164,7 @@ def at_most(
     scale: float = 1.0,
     of_hold: bool = False,
     by_finger: bool = False,
-) -> Rule:
+) -> Filter:
     """Return the rule that a value, times `scale`, is at most a limit; it rejects NaN.
 
     With `by_finger`, the value is a number per finger (n, k), and that of each used finger counts.
@@ -175,10 +175,10 @@ def at_most(
         return np.any(above & ~t["unused"], axis=1) if by_finger else above
 
     needs = (column, "unused") if by_finger else (column,)
-    return Rule(removal=removal, needs=needs, refuses=refuses, limit=limit, of_hold=of_hold)
+    return Filter(removal=removal, needs=needs, refuses=refuses, limit=limit, of_hold=of_hold)
 
 
-def _not_finite(column: str) -> Rule:
+def _not_finite(column: str) -> Filter:
     """Return the rule that each contact of a used finger has a finite point and normal."""
 
     def refuses(t: Table, limits: Limits) -> Flags:
@@ -187,17 +187,17 @@ def _not_finite(column: str) -> Rule:
         unused = np.tile(np.repeat(t["unused"], 3, axis=1), 2)
         return np.asarray(~(np.isfinite(t[column]) | unused).all(axis=1))
 
-    return Rule(removal=Removal.OFF_SURFACE, needs=(column, "unused"), refuses=refuses)
+    return Filter(removal=Removal.OFF_SURFACE, needs=(column, "unused"), refuses=refuses)
 
 
-def _unless(removal: Removal, column: str) -> Rule:
+def _unless(removal: Removal, column: str) -> Filter:
     """Return the rule that a flag is set."""
-    return Rule(removal=removal, needs=(column,), refuses=lambda t, limits: ~t[column])
+    return Filter(removal=removal, needs=(column,), refuses=lambda t, limits: ~t[column])
 
 
 #: All filters that judge a success on its own, in their order: the first that rejects it counts.
 #: The columns are those of `dataset.successes`.
-RULES = (
+FILTERS = (
     # A grasp vector has a contact for every finger that its preshape uses.
     _unless(Removal.MISSING_FINGER, "complete"),
     at_most(Removal.OTHER_LINKS, "other_links", "other_links", of_hold=True),
@@ -205,12 +205,12 @@ RULES = (
     at_most(Removal.TURNED, "turn", "max_turn_deg", scale=180.0 / np.pi, of_hold=True),
     _unless(Removal.NOT_SEEN, "seen"),
     _unless(Removal.OUT_OF_VIEW, "in_view"),
-    Rule(
+    Filter(
         removal=Removal.BISECTS_TABLE,
         needs=("camera_height",),
         refuses=lambda t, limits: t["camera_height"] < limits.min_camera_height,
     ),
-    Rule(
+    Filter(
         removal=Removal.FLAT_DEPTH,
         needs=("depth_variance",),
         refuses=lambda t, limits: t["depth_variance"] < limits.min_depth_variance,
@@ -220,17 +220,19 @@ RULES = (
     _not_finite("held_O"),
     at_most(Removal.OFF_SURFACE, "surface_distance", "max_surface_distance"),
     at_most(Removal.NORMAL_OFF, "normal_angle", "max_normal_angle_deg", scale=180.0 / np.pi),
-    at_most(Removal.SUSPICIOUS, "suspicion", "max_suspicion"),
-    at_most(Removal.SUSPICIOUS, "penetration", "max_penetration"),
-    at_most(Removal.SUSPICIOUS, "imbalance", "max_imbalance"),
-    at_most(Removal.SUSPICIOUS, "normal_sum", "max_normal_sum"),
+    at_most(Removal.ANOMALOUS, "anomaly", "max_anomaly"),
+    at_most(Removal.ANOMALOUS, "penetration", "max_penetration"),
+    at_most(Removal.ANOMALOUS, "imbalance", "max_imbalance"),
+    at_most(Removal.ANOMALOUS, "normal_sum", "max_normal_sum"),
     at_most(Removal.NEAR_CONE, "slip_use", "max_slip_use", by_finger=True),
 )
 #: The columns that the rules use.
-NEEDED = tuple(dict.fromkeys(name for rule in RULES for name in rule.needs))
+NEEDED = tuple(dict.fromkeys(name for rule in FILTERS for name in rule.needs))
 
 
-def first_removal(t: Table, limits: Limits, rules: Sequence[Rule] = RULES) -> npt.NDArray[np.uint8]:
+def first_removal(
+    t: Table, limits: Limits, rules: Sequence[Filter] = FILTERS
+) -> npt.NDArray[np.uint8]:
     """Return the reason of the first rule that rejects each row, `KEPT` (n,) if no rule does.
 
     A rule is left out if it is off or the table lacks one of its columns.

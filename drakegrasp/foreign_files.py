@@ -46,7 +46,7 @@ _KINDS = {
 }
 
 
-def refuse_irregular(path: Path, largest: int | None = None) -> None:
+def validate_regular(path: Path, largest: int | None = None) -> None:
     """Reject a path that is not a regular file, or a file that is too large.
 
     Args:
@@ -67,7 +67,7 @@ def refuse_irregular(path: Path, largest: int | None = None) -> None:
         raise _refusal(f"a file of {size:,} byte, of which only {stored:,} are on the disk")
 
 
-def refuse_address(path: str | Path) -> None:
+def validate_local(path: str | Path) -> None:
     """Reject an address, e.g. s3://, which would be a folder `s3:` here.
 
     Raises:
@@ -77,7 +77,7 @@ def refuse_address(path: str | Path) -> None:
         raise DataError(f"{path}: must be a path of this machine, got an address")
 
 
-def refuse_link(folder: Path) -> None:
+def validate_no_link(folder: Path) -> None:
     """Reject a symbolic link as a folder to write to: it may lead out of the dataset.
 
     Raises:
@@ -88,8 +88,8 @@ def refuse_link(folder: Path) -> None:
 
 
 def read_content(path: Path, largest: int = LARGEST_CONTENT) -> bytes:
-    """Return the bytes of a file, see `refuse_irregular`."""
-    refuse_irregular(path, largest)
+    """Return the bytes of a file, see `validate_regular`."""
+    validate_regular(path, largest)
     return path.read_bytes()
 
 
@@ -107,7 +107,7 @@ def read_npz(path: Path, largest: int = LARGEST_CONTENT) -> dict[str, Any]:
     """
     import numpy as np
 
-    refuse_irregular(path, largest)
+    validate_regular(path, largest)
     with path.open("rb") as file:
         with ZipFile(file) as packed:
             size = sum(item.file_size for item in packed.infolist())
@@ -119,13 +119,13 @@ def read_npz(path: Path, largest: int = LARGEST_CONTENT) -> dict[str, Any]:
 
 
 def read_text(path: Path, encoding: str = "utf-8") -> str:
-    """Return the text of a file, see `refuse_irregular`.
+    """Return the text of a file, see `validate_regular`.
 
     Raises:
         OSError: If the file cannot be read.
         UnicodeDecodeError: If the file is not text in this encoding.
     """
-    refuse_irregular(path, LARGEST_TEXT)
+    validate_regular(path, LARGEST_TEXT)
     return path.read_text(encoding=encoding)
 
 

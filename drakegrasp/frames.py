@@ -121,7 +121,7 @@ class Frame(StrEnum):
     PALM = "palm"  # {G}
 
 
-def refuse_other_frames(frame: object, known: Sequence[Frame]) -> None:
+def validate_frame(frame: object, known: Sequence[Frame]) -> None:
     """Reject anything but the name of one of these frames.
 
     Raises:

@@ -11,7 +11,7 @@ hands: the path of a hand file.
 importers: a function (path, hand) that returns arguments of `simulation.attempts.make_attempts`, or
     None for a file of another format. The name ends with the suffix of the files.
 protocols: a subclass of `protocols.protocol.MujocoProtocol`, except for `lift`.
-rules: a `filters.Rule`. The package's own rules are `filters.RULES`; each has a limit and a code.
+filters: a `filters.Filter`. The package's own are `filters.FILTERS`; each has a limit and a code.
 samplers: a `simulation.candidates.Sampler`, like a user-defined one.
 
 A user-defined class is named `file.py:Name`, and imported from the file's text. A configuration
@@ -41,7 +41,7 @@ from drakegrasp.errors import ConfigError, MachineError, listed, one_line
 
 #: Kinds of named things; a group of entry points is `drakegrasp.` and one of these.
 Kind: TypeAlias = Literal[
-    "clusters", "exporters", "hands", "importers", "protocols", "rules", "samplers"
+    "clusters", "exporters", "hands", "importers", "protocols", "filters", "samplers"
 ]
 #: Number of imported files that a process caches.
 _KEPT_FILES = 32

@@ -38,8 +38,8 @@ def parse_yaml(text: str | bytes) -> Any:
         node = loader.get_single_node()
         if node is None:
             return None
-        _refuse_large(node)
-        _refuse_twins(node)
+        _validate_size(node)
+        _validate_distinct(node)
         return loader.construct_document(node)
     except RecursionError:
         raise yaml.YAMLError("values nested too deeply") from None
@@ -61,7 +61,7 @@ def parse_yaml_once(text: str | bytes) -> Any:
 _parsed = lru_cache(maxsize=16)(parse_yaml)
 
 
-def _refuse_large(root: yaml.Node) -> None:
+def _validate_size(root: yaml.Node) -> None:
     sizes: dict[int, int] = {}
 
     def size(node: yaml.Node) -> int:
@@ -77,7 +77,7 @@ def _refuse_large(root: yaml.Node) -> None:
         raise yaml.YAMLError(f"aliases that stand for more than {MOST_VALUES:,} values")
 
 
-def _refuse_twins(root: yaml.Node) -> None:
+def _validate_distinct(root: yaml.Node) -> None:
     """Reject a mapping with a repeated key, of which PyYAML would use the last value."""
     nodes, seen = [root], set()
     while nodes:

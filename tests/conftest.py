@@ -84,7 +84,7 @@ def builds_here(monkeypatch: pytest.MonkeyPatch) -> None:
     no_cluster = nullcontext(SimpleNamespace(dashboard_link=""))
     building = "drakegrasp.api.building"
     monkeypatch.setattr(f"{building}.joined", lambda *_: no_cluster)
-    monkeypatch.setattr(f"{building}.admitted_workers", lambda *_: nullcontext(False))
+    monkeypatch.setattr(f"{building}.checked_workers", lambda *_: nullcontext(False))
     execute = Mock(side_effect=run_here, pool=None)
     monkeypatch.setattr(f"{building}.DaskExecutor", lambda *_, **__: execute)
 

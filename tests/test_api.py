@@ -152,7 +152,7 @@ def test_workers_get_tasks_of_few_grasps(
             yield [(grasp.index, result.findings()) for grasp in task]
 
     monkeypatch.setattr(verifying, "joined", lambda *_: nullcontext(client))
-    monkeypatch.setattr(verifying, "admitted_workers", lambda *_: nullcontext())
+    monkeypatch.setattr(verifying, "checked_workers", lambda *_: nullcontext())
     monkeypatch.setattr(verifying, "DaskExecutor", lambda _: execute)
     placed = place(np.tile(GRASP.ravel(), (count, 1)), cube)
     run_verification(placed, cube.config, client=client, show=False)  # type: ignore[arg-type]
@@ -427,7 +427,7 @@ def test_workers_are_asked_whether_they_see_the_meshes_of_a_build(
     def refuse(_client: object, _config: object, _out: Path, meshes: list[Path]) -> None:
         raise MachineError(f"asked for {', '.join(path.name for path in meshes)}")
 
-    monkeypatch.setattr(building, "admitted_workers", refuse)
+    monkeypatch.setattr(building, "checked_workers", refuse)
     client = nullcontext(SimpleNamespace(dashboard_link=""))
     with pytest.raises(MachineError, match="asked for 1_box_a"):
         build_dataset(folder, tmp_path / "out", cluster=client, show=False)  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from drakegrasp import foreign_files
-from drakegrasp.foreign_files import refuse_irregular
+from drakegrasp.foreign_files import validate_regular
 
 
 def test_large_file_is_read_in_parts_unless_it_consists_of_holes(
@@ -18,13 +18,13 @@ def test_large_file_is_read_in_parts_unless_it_consists_of_holes(
     solid.write_bytes(b"x" * 2**20)
     holes.write_bytes(b"x")
     os.truncate(holes, 2**40)
-    refuse_irregular(solid)
+    validate_regular(solid)
     with pytest.raises(OSError, match=r"1,099,511,627,776 byte, of which only [0-9,]+ are on"):
-        refuse_irregular(holes)
+        validate_regular(holes)
     monkeypatch.setattr(foreign_files, "LARGE", 2**10)
-    refuse_irregular(solid)
+    validate_regular(solid)
     with pytest.raises(OSError, match="1,048,576 byte, more than 1,024"):
-        refuse_irregular(solid, 2**10)
+        validate_regular(solid, 2**10)
 
 
 def test_share_of_a_file_that_is_on_the_disk_decides(
@@ -37,7 +37,7 @@ def test_share_of_a_file_that_is_on_the_disk_decides(
     path.write_bytes(b"x" * 300_000)
     os.truncate(path, 1_000_000)
     with pytest.raises(OSError, match=r"1,000,000 byte, of which only 3\d\d,\d{3} are on"):
-        refuse_irregular(path)
+        validate_regular(path)
     path.write_bytes(b"x" * 900_000)
     os.truncate(path, 1_000_000)
-    refuse_irregular(path)
+    validate_regular(path)

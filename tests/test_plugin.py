@@ -40,7 +40,7 @@ ADDED: dict[registry.Kind, str] = {
     "hands": "jaw",
     "importers": "palms.palms",
     "protocols": "slippery",
-    "rules": "calm",
+    "filters": "calm",
     "samplers": "down",
 }
 

@@ -11,19 +11,19 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Unpack
 
-from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, dashboard_line, has_dashboard, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.cluster.wire import by_wire
+from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import BUILD_PRESET, Config
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
 from drakegrasp.errors import DataError, GraspError, counted
 from drakegrasp.exchange.attempts import read_attempts
-from drakegrasp.foreign_files import refuse_address
+from drakegrasp.foreign_files import validate_local
 from drakegrasp.generation.directory import BuildDirectory, open_directory
 from drakegrasp.generation.pipeline import BuildReport, build
-from drakegrasp.generation.request import BUILTIN, build_config, refuse_unknown
+from drakegrasp.generation.request import BUILTIN, build_config, validate_known
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -86,7 +86,7 @@ def build_dataset(
         MachineError: If there is no scheduler, the workers cannot do the work, or the disk is full;
             the same call continues when that is fixed.
     """
-    refuse_address(out)
+    validate_local(out)
     running = joined(client, workers) if cluster is None else cluster
     config = config or load_config(BUILD_PRESET)
     work = _asked(objects, config, units, manifest, only, postures, read_as)
@@ -131,7 +131,7 @@ def _workers_of(
         if show and has_dashboard() and client.dashboard_link:
             sys.stderr.write(f"{dashboard_line(client)}\n")
         meshes = [source.path for source in sources]
-        with admitted_workers(client, config, out, meshes) as travels:
+        with checked_workers(client, config, out, meshes) as travels:
             execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
             if not travels:
                 yield execute, execute.pool
@@ -181,7 +181,7 @@ def _asked(
     else:
         sources = find_meshes(objects, units=units, manifest=manifest)
         names = [source.name for source in sources]
-    refuse_unknown(only, names)
+    validate_known(only, names)
     chosen = [name for name in names if not only or name in only]
     if postures is not None:
         postures = postures.refuse(unknown_objects(postures, names))

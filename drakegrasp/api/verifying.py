@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import Workers, joined
 from drakegrasp.cluster.executor import DaskExecutor
+from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
@@ -189,7 +189,7 @@ def verify_grasps(
         drawn, frame = config is None, frame or "camera"
         placed = contacts_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
     else:
-        _refuse_other_targets(on)
+        _validate_target(on)
         if rows is not None:
             raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
         thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
@@ -198,7 +198,7 @@ def verify_grasps(
     return run_verification(placed, used, client=client, show=show, explained=False)
 
 
-def _refuse_other_targets(on: object) -> None:
+def _validate_target(on: object) -> None:
     if not isinstance(on, str | Path | trimesh.Trimesh | Placed):
         raise GraspError(
             "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a Sample or a "
@@ -249,7 +249,7 @@ def run_verification(
     with (
         cluster as joint,
         progress_bar("verify", "grasps", show=show) as report,
-        admitted_workers(joint, config),
+        checked_workers(joint, config),
     ):
         tasks = TASKS_PER_WORKER * max(len(joint.nthreads()), 1)
         together = min(max(len(grasps) // tasks, 1), MOST_TOGETHER)

@@ -65,19 +65,19 @@ def read_whole(kind: Any, tokens: tuple[Token, ...]) -> int:
         raise ValueError(f"must be a whole number, got {tokens[0].value!r}") from None
 
 
-def refuse_missing(kind: Any, path: Path | None) -> None:
+def validate_existing(kind: Any, path: Path | None) -> None:
     """Reject a path at which nothing is."""
     if path is not None and not path.exists():
         raise ValueError("Must exist, got nothing there.")
 
 
-def refuse_no_file(kind: Any, path: Path | None) -> None:
+def validate_existing_file(kind: Any, path: Path | None) -> None:
     """Reject a path that is not that of a file."""
     if path is not None and not path.is_file():
         raise ValueError(f"Must be a file, got {'a folder' if path.is_dir() else 'nothing there'}")
 
 
-def refuse_folder(kind: Any, path: Path | None) -> None:
+def validate_no_folder(kind: Any, path: Path | None) -> None:
     """Reject the path of a folder where a file is written."""
     if path is not None and path.is_dir():
         raise ValueError("Must be a file, got a folder.")
@@ -93,9 +93,9 @@ def tidy_dataset(kind: Any, path: Path) -> None:
 
 #: Paths: any, of a file or folder that exists, of a file that exists, of a file to write.
 AnyPath: TypeAlias = Annotated[Path, Parameter(converter=read_place, metavar="PATH")]
-Existing: TypeAlias = Annotated[AnyPath, Parameter(validator=refuse_missing)]
-File: TypeAlias = Annotated[AnyPath, Parameter(validator=refuse_no_file, metavar="FILE")]
-NewFile: TypeAlias = Annotated[AnyPath, Parameter(validator=refuse_folder, metavar="FILE")]
+Existing: TypeAlias = Annotated[AnyPath, Parameter(validator=validate_existing)]
+File: TypeAlias = Annotated[AnyPath, Parameter(validator=validate_existing_file, metavar="FILE")]
+NewFile: TypeAlias = Annotated[AnyPath, Parameter(validator=validate_no_folder, metavar="FILE")]
 Folder: TypeAlias = Annotated[AnyPath, Parameter(metavar="DIR")]
 #: The directory of a dataset or one of its files, and a data file or its address.
 Dataset: TypeAlias = Annotated[AnyPath, Parameter(validator=tidy_dataset)]

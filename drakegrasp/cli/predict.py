@@ -29,7 +29,7 @@ KINDS = {
     "a cloud": ("units",),
     "a depth image": ("camera", "mask", "camera_pose", "depth_scale"),
 }
-#: Number of proposals that are lifted if it is not given.
+#: Number of grasps for one object that are lifted if it is not given; scenes have many views.
 SIMULATED = 5
 
 
@@ -38,7 +38,7 @@ def predict(
     /,
     *,
     out: Annotated[AnyPath, Parameter(metavar="FILE")],
-    simulate: Annotated[Count, Parameter(metavar="K", validator=Number(gte=0))] = SIMULATED,
+    simulate: Annotated[Count | None, Parameter(metavar="K", validator=Number(gte=0))] = None,
     count: Positive | None = None,
     overrides: Settings = (),
     split: Split | None = None,
@@ -70,7 +70,8 @@ def predict(
     Args:
         source: Scenes, a cloud or a depth image.
         out: HDF5 file (.h5) to write.
-        simulate: Largest number of grasps of a view that are lifted; 0 for none.
+        simulate: Largest number of grasps of a view that are lifted; 0 for none. [default: 5 for
+            one object, 0 for scenes]
         count: Maximum number of grasps of a view. [default: all that are proposed]
         overrides: Change one setting of the preset fast, or for scenes of the dataset, e.g.
             hand=allegro or objects.mass=0.3; may be given several times.
@@ -92,7 +93,7 @@ def predict(
     from drakegrasp.scoring.predicting import predict as predict_grasps
 
     # All input is checked before anything is predicted.
-    _refuse_place(out, source)
+    _validate_place(out, source)
     options: dict[str, Any] = {
         "split": split,
         "workers": workers,
@@ -102,12 +103,12 @@ def predict(
     }
     options |= {"camera_pose": camera_pose, "depth_scale": depth_scale}
     kind = _kind_of(source, camera)
-    _refuse_others(kind, options)
+    _validate_options(kind, options)
 
     # Scenes have many objects, the other kinds one.
     if kind == "scenes":
         found, hand = _of_scenes(
-            source, split or "test", simulate, count, overrides, workers, show=not quiet
+            source, split or "test", simulate or 0, count, overrides, workers, show=not quiet
         )
         write_attempts(out, found, hand)
         say(str(out))
@@ -120,7 +121,8 @@ def predict(
         assert camera is not None and mask is not None
         depth = _read_depth(source, depth_scale)
         cloud, view = _see(source, depth, camera, mask, camera_pose, show=not quiet)
-    found, ranking = predict_grasps(cloud, view, config, simulate=simulate, count=count)
+    tries = SIMULATED if simulate is None else simulate
+    found, ranking = predict_grasps(cloud, view, config, simulate=tries, count=count)
     pose = None if view is None else np.asarray(view.X_TC)
     write_attempts(out, _seen_from(found, pose), load_hand(config.hand_source))
     say(str(out))
@@ -128,7 +130,7 @@ def predict(
         say(ranking.explain(), err=True)
 
 
-def _refuse_place(out: Path, source: Path) -> None:
+def _validate_place(out: Path, source: Path) -> None:
     """Reject a file that cannot be written, or would replace one that is not of postures.
 
     Raises:
@@ -136,13 +138,13 @@ def _refuse_place(out: Path, source: Path) -> None:
         DataError: If it cannot be written.
     """
     from drakegrasp.exchange.attempts import holds_postures
-    from drakegrasp.verification.result_files import refuse_unwritable
+    from drakegrasp.verification.result_files import validate_writable
 
     if out.suffix.lower() not in HDF5:
         raise UsageError(f"--out must be a file {' or '.join(HDF5)}, got {str(out)!r}")
     if out.exists() and out.samefile(source):
         raise UsageError(f"--out must be another file than INPUT, got {str(out)!r}")
-    refuse_unwritable(out)
+    validate_writable(out)
     try:
         known = not out.exists() or holds_postures(out)
     except GraspError:  # no HDF5 file
@@ -167,7 +169,7 @@ def _kind_of(source: Path, camera: str | None) -> str:
     raise UsageError(f"INPUT must be .hdf5, .npy, .ply or .png, got {str(source)!r}")
 
 
-def _refuse_others(kind: str, options: dict[str, Any]) -> None:
+def _validate_options(kind: str, options: dict[str, Any]) -> None:
     """Reject options of other kinds of INPUT, and a depth image without camera and mask.
 
     Raises:

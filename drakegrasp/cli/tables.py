@@ -19,7 +19,7 @@ from drakegrasp.dataset.statistics import (
     count_splits,
     held_note,
     objects_without_samples,
-    refuse_unassembled,
+    validate_assembled,
 )
 from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
@@ -152,7 +152,7 @@ def make_console() -> Console:
 
 def print_stats(out: Path) -> None:
     """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
-    refuse_unassembled(out)
+    validate_assembled(out)
     console, funnel = make_console(), count_funnel(out)
     console.print(funnel_table(funnel))
     console.print()

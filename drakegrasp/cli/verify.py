@@ -161,14 +161,14 @@ def _by_lift(path: Path, target: Target, out: Path | None, *, lines: bool, **how
     """Write the verdicts of a lift, and print their counts."""
     from drakegrasp.api.verifying import run_verification
     from drakegrasp.exchange.columns import HDF5_SUFFIXES
-    from drakegrasp.verification.result_files import json_line, refuse_unwritable, write_results
+    from drakegrasp.verification.result_files import json_line, validate_writable, write_results
 
     # All input is read and checked before anything is simulated.
     if out is not None:
         if out.suffix.lower() not in HDF5_SUFFIXES:
             raise UsageError(f"--out must be a file {' or '.join(HDF5_SUFFIXES)}, got {out}")
         with wrong_input():
-            refuse_unwritable(out)
+            validate_writable(out)
     grasps, config, rows = place(path, target)
 
     def deliver(index: int, result: Verification) -> None:

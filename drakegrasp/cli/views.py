@@ -29,7 +29,7 @@ def inspect(
     """Look at grasps in a browser, and reject them.
 
     The page shows every attempt in OUT with images, contacts, forces and a 3D view, the most
-    suspicious first. Rejections are written to OUT/reject.json immediately; assemble --reject reads
+    anomalous first. Rejections are written to OUT/reject.json immediately; assemble --reject reads
     that file. The page can be reached from this machine only. Ctrl-C ends the command.
 
     Args:
@@ -71,12 +71,12 @@ def figures(
         folder: Folder of the figures. [default: OUT/figures]
         quiet: Show no progress.
     """
-    from drakegrasp.foreign_files import refuse_link
+    from drakegrasp.foreign_files import validate_no_link
     from drakegrasp.pictures.figures import write_figures
 
     if folder is None:
         folder = out / "figures"
-        refuse_link(folder)
+        validate_no_link(folder)
     with progress_bar("draw", "figures", show=not quiet) as progress:
         written = write_figures(out, folder, progress=progress)
     for name, why in written.left_out.items():
@@ -114,7 +114,7 @@ def export_samples(
         quiet: Show no progress.
     """
     from drakegrasp.exchange.export import export_dataset, options_of
-    from drakegrasp.foreign_files import refuse_link
+    from drakegrasp.foreign_files import validate_no_link
 
     # What only some formats take.
     options = given(licence=licence)
@@ -124,7 +124,7 @@ def export_samples(
 
     if directory is None:
         directory = out / f"export_{form}"
-        refuse_link(directory)
+        validate_no_link(directory)
     counts = registry.summary("exporters", form, "COUNTS") or "sample"
     with progress_bar("export", f"{counts}s", show=not quiet) as progress:
         count = export_dataset(out, directory, form, progress=progress, **options)

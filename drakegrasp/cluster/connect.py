@@ -31,7 +31,7 @@ from tornado.ioloop import IOLoop
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.foreign_files import read_json
 from drakegrasp.generation.prepare import PREPARE_SECONDS
-from drakegrasp.runtime.executor import count_workers, refuse_to_start_workers
+from drakegrasp.runtime.executor import count_workers, validate_main_module
 from drakegrasp.runtime.journal import wall_limit
 
 #: Address that only this machine can reach.
@@ -261,7 +261,7 @@ def joined(client: Client | None, workers: Workers) -> AbstractContextManager[Cl
     return nullcontext(client)
 
 
-def refuse_open(address: str, tls: bool) -> None:
+def validate_tls(address: str, tls: bool) -> None:
     """Reject the address of a scheduler that wants no certificate, unless `tls` is False.
 
     Raises:
@@ -275,7 +275,7 @@ def refuse_open(address: str, tls: bool) -> None:
 
 
 def _connect_remote(address: str, security: Security | None, tls: bool) -> Client:
-    refuse_open(address, tls)
+    validate_tls(address, tls)
     try:
         return _RemoteClient(address, timeout=CONNECT_SECONDS, security=security)
     except (OSError, RuntimeError, TypeError, ValueError) as error:
@@ -325,7 +325,7 @@ def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
 
 @contextmanager
 def _start_local(workers: int, security: Security | None, memory: str) -> Iterator[Client]:
-    refuse_to_start_workers()
+    validate_main_module()
     with _undisturbed_loop() as loop:
         try:
             cluster = PrivateCluster(workers, loop=loop, security=security, memory=memory)

@@ -15,7 +15,7 @@ from typing import ClassVar
 from dask.utils import parse_bytes
 from distributed import Client
 
-from drakegrasp.cluster.connect import chosen_security, connect, refuse_open
+from drakegrasp.cluster.connect import chosen_security, connect, validate_tls
 from drakegrasp.errors import ConfigError, counted
 from drakegrasp.runtime.executor import count_workers
 
@@ -118,7 +118,7 @@ class Running(Local):
         """Reject options that contradict each other, and an address that wants no certificate."""
         super().__post_init__()
         if self.address is not None:
-            refuse_open(self.address, self.tls)
+            validate_tls(self.address, self.tls)
 
     def line(self) -> str:
         """Return a description of the workers that will be used."""

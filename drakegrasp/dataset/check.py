@@ -49,9 +49,9 @@ from drakegrasp.dataset.paths import (
     model_path,
     plan_path,
     recorded_model,
-    refuse_changed_model,
+    validate_model_file,
 )
-from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, refuse_other_schema
+from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, validate_schema
 from drakegrasp.dataset.shards import ShardHeader, open_shard
 from drakegrasp.dataset.survey import headers_by_object, known_homes, shards_sha256
 from drakegrasp.dataset.trials import Stamp, Trials, reopened, stamp
@@ -71,7 +71,7 @@ from drakegrasp.hand.folder import HAND_FOLDER, hand_digest
 from drakegrasp.objects.model import fit_contacts, load_object
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.executor import Executor, in_order, run_here
-from drakegrasp.runtime.files import refuse_broken_seal
+from drakegrasp.runtime.files import validate_seal
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.table import Table
 from drakegrasp.vision.camera import project
@@ -255,7 +255,7 @@ def _header(path: Path) -> _Look:
     """Check the attributes and the layout of a file; no row is read."""
     kinds, tables = FILES[path.name]
     with open_hdf5(path) as file:
-        refuse_other_schema(path, file.attrs.get("schema_version"))
+        validate_schema(path, file.attrs.get("schema_version"))
         mistakes, layout = list(attribute_mistakes(file, kinds)), list(differences(file, tables))
         # A group with an invalid column is not read; without sound attributes, nothing is.
         broken = {*tables} if mistakes else {each.path[1:].split("/")[0] for each in layout}
@@ -294,7 +294,7 @@ def _seal(path: Path) -> list[Violation]:
     """Return a violation if a file is not as it was written."""
     found = list[Violation]()
     with _reported(found, path.name, "the file must be as it was written"):
-        refuse_broken_seal(path, "file", None)
+        validate_seal(path, "file", None)
     return found
 
 
@@ -329,7 +329,7 @@ def _check_object(out: Path, entry: ObjectEntry, headers: Iterable[ShardHeader])
     with _reported(found, names[plan], "the plan must be as it was written"):
         expected = recorded_model(out, entry.name)
         with _reported(found, names[model], "the meshes must be as they were written"):
-            refuse_changed_model(out, entry.name, expected)
+            validate_model_file(out, entry.name, expected)
     with _reported(found, names[model], f"the meshes must be those of {FILE_NAME}"):
         if (sha256 := load_object(model).mesh_sha256) != entry.mesh_sha256:
             raise DataError(f"mesh_sha256 must be {entry.mesh_sha256}, got {sha256}")

@@ -36,10 +36,10 @@ from drakegrasp.dataset.schema import (
     VIEW_FIELDS,
     VISIBLE_FIELDS,
     Field,
-    refuse_other_schema,
+    validate_schema,
 )
 from drakegrasp.errors import DataError, first_line, printable
-from drakegrasp.foreign_files import parse_json, refuse_irregular
+from drakegrasp.foreign_files import parse_json, validate_regular
 from drakegrasp.table import AnyArray as AnyArray
 from drakegrasp.table import Table
 
@@ -89,7 +89,7 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
         DataError: If the file has links, values stored outside of it, or more rows than it can
             hold.
     """
-    refuse_irregular(path)
+    validate_regular(path)
     try:
         file = h5py.File(path, "r")
     except OSError as error:
@@ -262,9 +262,9 @@ def _opened_whole(path: Path, what: str, kinds: Kinds, tables: Tables) -> Iterat
         # has none.
         if "schema_version" not in file.attrs:
             raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
-        refuse_other_schema(path, file.attrs["schema_version"])
-        refuse_first(path, attribute_mistakes(file, kinds))
-        refuse_first(path, differences(file, tables))
+        validate_schema(path, file.attrs["schema_version"])
+        validate_file(path, attribute_mistakes(file, kinds))
+        validate_file(path, differences(file, tables))
         yield file
 
 
@@ -281,7 +281,7 @@ open_samples, open_trials, open_scenes = (
 )
 
 
-def refuse_first(path: Path, mistakes: Iterable[object]) -> None:
+def validate_file(path: Path, mistakes: Iterable[object]) -> None:
     """Reject a file that has any mistake; the error reports the first one.
 
     Raises:
@@ -439,11 +439,11 @@ def read_codes(
     """
     values: npt.NDArray[Any] = dataset[rows]
     path = Path(dataset.file.filename)
-    refuse_other_codes(path, dataset.name, values, codes, rows.start or 0)
+    validate_codes(path, dataset.name, values, codes, rows.start or 0)
     return values
 
 
-def refuse_other_codes(
+def validate_codes(
     path: Path,
     name: str,
     values: npt.NDArray[Any],

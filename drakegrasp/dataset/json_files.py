@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=BaseModel)
 
 
-def _refuse_no_name(text: str) -> str:
+def _validate_name(text: str) -> str:
     """Raise an error if a name, used as a file's name, could leave the directory."""
     if not is_name(text):
         raise ValueError(f"a name must be {NAME_RULE}, got {text!r}")
@@ -30,7 +30,7 @@ def _refuse_no_name(text: str) -> str:
 
 
 #: The name of an object or a class.
-Name = Annotated[str, AfterValidator(_refuse_no_name)]
+Name = Annotated[str, AfterValidator(_validate_name)]
 
 
 def stated(entry: DataclassInstance) -> dict[str, Any]:

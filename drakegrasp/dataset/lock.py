@@ -58,7 +58,7 @@ def build_lock(out: Path) -> Iterator[str | None]:
     with held:
         dead = _sign(path)
         try:
-            _refuse_linked_folders(out)
+            _validate_folders(out)
             yield dead
         finally:
             path.unlink(missing_ok=True)
@@ -103,7 +103,7 @@ def tidy(out: Path) -> None:
             sweep_temporary(out)
 
 
-def _refuse_linked_folders(out: Path) -> None:
+def _validate_folders(out: Path) -> None:
     """Raise an error if a subfolder of the dataset is a symbolic link.
 
     A build therefore never writes outside of the dataset.

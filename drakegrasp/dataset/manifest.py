@@ -39,7 +39,7 @@ from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import (
     CONVENTIONS,
     SCHEMA_VERSION,
-    refuse_other_schema,
+    validate_schema,
 )
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.split import Home
@@ -57,7 +57,7 @@ VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
 
 
-def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
+def _validate_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
     """Raise an error if the numbers are not a rigid motion."""
     try:
         read_pose(unpack_pose(np.array(packed)), "it")
@@ -66,7 +66,7 @@ def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
     return packed
 
 
-def _refuse_unprintable(text: str) -> str:
+def _validate_printable(text: str) -> str:
     """Raise an error if a text is not printable, since it could control a terminal."""
     if not text.isprintable():
         raise ValueError(f"it must be printable, got {text!r}")
@@ -78,10 +78,10 @@ DIGEST = "sha256"
 #: Types of the values in a manifest; they are checked when a manifest is read.
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
 Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
-Text = Annotated[str, AfterValidator(_refuse_unprintable)]
+Text = Annotated[str, AfterValidator(_validate_printable)]
 Whole = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Pose = Annotated[
-    tuple[Number, ...], Field(min_length=12, max_length=12), AfterValidator(_refuse_no_pose)
+    tuple[Number, ...], Field(min_length=12, max_length=12), AfterValidator(_validate_pose)
 ]
 
 
@@ -315,7 +315,7 @@ def read_manifest(out: Path) -> Manifest:
         ) from None
 
     # Check the version first: another schema may have other keys.
-    refuse_other_schema(path, tree.get("schema_version"))
+    validate_schema(path, tree.get("schema_version"))
     stored = validated(path, content, _Stored)
     try:
         config = parse_stored(stored.config)
@@ -377,7 +377,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
 
     # Without a manifest, it may only contain what an interrupted build leaves.
     if not (out / FILE_NAME).exists():
-        _refuse_other_files(out)
+        _validate_files(out)
         return None
 
     # With a manifest, the build must continue the same dataset.
@@ -398,7 +398,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     return manifest
 
 
-def _refuse_other_files(out: Path) -> None:
+def _validate_files(out: Path) -> None:
     """Raise an error if a directory has files that none of our builds writes.
 
     Raises:

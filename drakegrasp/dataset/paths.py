@@ -9,7 +9,7 @@ from drakegrasp.dataset.hdf5 import opened
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import NAME_RULE, is_name, read_content
-from drakegrasp.runtime.files import refuse_broken_seal
+from drakegrasp.runtime.files import validate_seal
 
 #: Files of all attempts, of samples by camera and of scenes, and the manifest.
 TRIALS_FILE = "trials.hdf5"
@@ -74,12 +74,12 @@ def recorded_model(out: Path, name: str) -> str:
         DataError: If the plan is missing or has changed.
     """
     path = plan_path(out, name)
-    refuse_broken_seal(path, "plan of an object")
+    validate_seal(path, "plan of an object")
     with opened(path, "the plan of an object") as file:
         return str(file.attrs["model_sha256"])
 
 
-def refuse_changed_model(out: Path, name: str, expected: str) -> None:
+def validate_model_file(out: Path, name: str, expected: str) -> None:
     """Reject the file of an object's meshes if it is missing or its hash differs from `expected`.
 
     Raises:

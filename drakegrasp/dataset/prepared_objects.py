@@ -23,7 +23,7 @@ from drakegrasp.dataset.paths import (
     model_path,
     plan_path,
     recorded_model,
-    refuse_changed_model,
+    validate_model_file,
 )
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
@@ -150,7 +150,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     path = plan_path(out, name)
 
     # Both files must be unchanged, and belong to this configuration.
-    refuse_changed_model(out, name, recorded_model(out, name))
+    validate_model_file(out, name, recorded_model(out, name))
     with opened(path, "the plan of an object") as file:
         attributes = dict(file.attrs)
         resting, palms = ({name: file[name][:] for name in names} for names in (_RESTING, _PALMS))

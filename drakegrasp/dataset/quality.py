@@ -1,9 +1,9 @@
 """Quality of grasps: how implausible they look.
 
-Input: columns of trials.hdf5. Output: a score of suspicion with its parts.
+Input: columns of trials.hdf5. Output: an anomaly score with its parts.
 
-The score of suspicion tells which grasps a person should look at first. By itself it removes
-nothing; a limit in the configuration (`filters.max_suspicion`) can. Each part is a quantity that is
+The anomaly score tells which grasps a person should look at first. By itself it removes
+nothing; a limit in the configuration (`filters.max_anomaly`) can. Each part is a quantity that is
 small for a firm grasp, divided by the value above which this part alone is reason enough to look,
 see `PARTS`:
 
@@ -91,7 +91,7 @@ PARTS = (
 )
 # fmt: on
 
-#: Columns of `/trials` that `suspicion` reads.
+#: Columns of `/trials` that `anomaly` reads.
 COLUMNS = (
     "outcome",
     "unused",
@@ -113,7 +113,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Suspicion:
+class Anomaly:
     """How implausible n attempts look.
 
     Attributes:
@@ -129,7 +129,7 @@ class Suspicion:
     shares: Mapping[str, Array]
 
 
-def suspicion(columns: Mapping[str, npt.NDArray[Any]]) -> Suspicion:
+def anomaly(columns: Mapping[str, npt.NDArray[Any]]) -> Anomaly:
     """Return how implausible attempts look, and why.
 
     An attempt that ended before the lift is judged by the parts that it has. A contact without a
@@ -155,7 +155,7 @@ def suspicion(columns: Mapping[str, npt.NDArray[Any]]) -> Suspicion:
     # The sum is over the parts that an attempt has.
     squares = np.nan_to_num(np.stack([shares[part.name] for part in PARTS], axis=-1))
     score = np.where(closed, norm(squares), np.nan)
-    return Suspicion(score=score, values=values, shares=shares)
+    return Anomaly(score=score, values=values, shares=shares)
 
 
 def _values(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:

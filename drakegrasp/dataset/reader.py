@@ -31,7 +31,7 @@ from drakegrasp.dataset.hdf5 import (
 )
 from drakegrasp.dataset.schema import DATA_FIELDS, PREDICTED_ROW_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line
-from drakegrasp.foreign_files import refuse_address
+from drakegrasp.foreign_files import validate_local
 from drakegrasp.grasp import unused_fingers
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class GraspDataset:
     ) -> None:
         if split not in SPLITS:
             raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
-        refuse_address(path)
+        validate_local(path)
         self.path, self.split = Path(path).absolute(), split
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
@@ -219,7 +219,7 @@ class GraspDataset:
         Raises:
             DataError: If there is no such field.
         """
-        _refuse_other_fields([name])
+        _validate_fields([name])
         group = self._open()[self.split]
         try:
             return read_columns(group, DATA_FIELDS, (name,), slice(start, stop))[name]
@@ -236,7 +236,7 @@ class GraspDataset:
             DataError: If there is no such field.
             MachineError: If torch is not installed.
         """
-        _refuse_other_fields(fields)
+        _validate_fields(fields)
         if find_spec("torch") is None:
             raise MachineError("to_torch needs torch, got none: pip install 'drakegrasp[torch]'")
         from drakegrasp.dataset.torch_samples import TorchSamples
@@ -312,7 +312,7 @@ def _content(file: h5py.File, split: str) -> str:
     return digest.hexdigest()
 
 
-def _refuse_other_fields(names: Sequence[str]) -> None:
+def _validate_fields(names: Sequence[str]) -> None:
     for name in names:
         if name not in FIELDS:
             raise DataError(f"field must be one of {', '.join(FIELDS)}, got {name!r}")

@@ -30,13 +30,13 @@ from drakegrasp.dataset.hdf5 import (
     opened,
     read_columns,
     read_texts,
-    refuse_other_codes,
+    validate_codes,
 )
 from drakegrasp.dataset.reader import GraspDataset, emptiness_of
 from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS
 from drakegrasp.dataset.trials import Trials, reopened, stamp
 from drakegrasp.errors import DataError
-from drakegrasp.foreign_files import parse_json, refuse_address
+from drakegrasp.foreign_files import parse_json, validate_local
 from drakegrasp.frames import X_WT, Frame, invert_pose, pack_pose, unpack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.outcomes import LOST, Outcome
@@ -150,17 +150,17 @@ class SceneDataset:
         seed: int = 0,
         cache: int = 512 << 20,
     ) -> None:
-        _refuse_other("frame", frame, FRAMES)
-        _refuse_other("negatives", negatives, get_args(Negatives))
-        _refuse_other("balance", balance, get_args(Balance))
-        _refuse_other("positives", positives, get_args(Positives))
-        _refuse_other("split", split, SPLITS)
+        _validate_same("frame", frame, FRAMES)
+        _validate_same("negatives", negatives, get_args(Negatives))
+        _validate_same("balance", balance, get_args(Balance))
+        _validate_same("positives", positives, get_args(Positives))
+        _validate_same("split", split, SPLITS)
         for name, count in (("points", points), ("grasps", grasps)):
             if count is not None and count < 1:
                 raise DataError(f"{name} must be 1 or more, got {count}")
         if not 0.0 <= on_object <= 1.0:
             raise DataError(f"on_object must be 0 to 1, got {on_object}")
-        refuse_address(path)
+        validate_local(path)
         self.path = Path(path).absolute()
         self.split, self.frame, self.epoch = split, frame, 0
         self._points, self._grasps, self._seed = points, grasps, seed
@@ -243,7 +243,7 @@ class SceneDataset:
 
     def grasps_in(self, view: int, *, frame: str = Frame.TABLE) -> dict[str, AnyArray]:
         """Return all g grasps of a view's scene, by the keys of an item."""
-        _refuse_other("frame", frame, FRAMES)
+        _validate_same("frame", frame, FRAMES)
         X_AT = invert_pose(self._X_TC[view]) if frame == "camera" else np.eye(4)
         return self._grasps_of(view, self.rows_in(self._scene_of[view]), X_AT)
 
@@ -282,7 +282,7 @@ class SceneDataset:
             ("/views/scene", views["scene"], count),
             ("/grasps/scene", self.tables["grasps"]["scene"], count),
         ):
-            refuse_other_codes(self.path, name, values, codes)
+            validate_codes(self.path, name, values, codes)
 
         # The grasps of a scene and the rows of a view are consecutive.
         grasps = np.bincount(self.tables["grasps"]["scene"], minlength=count)
@@ -513,7 +513,7 @@ _AS_STORED = (
 )
 
 
-def _refuse_other(name: str, value: object, known: tuple[str, ...]) -> None:
+def _validate_same(name: str, value: object, known: tuple[str, ...]) -> None:
     if value not in known:
         raise DataError(f"{name} must be one of {', '.join(known)}, got {value!r}")
 
@@ -613,13 +613,13 @@ class SceneRows(GraspDataset):
 
         # The own grasp of each view, and the trial of this grasp.
         trials, ids = Trials(self.path.parent), np.zeros(self._length, dtype=np.int64)
-        refuse_other_state(self.path, trials)
+        validate_state(self.path, trials)
         grasps = []
         for i, view in enumerate(self.views.tolist()):
             own = data.grasp_of(view, Stream(0, _OWN, view))
             ids[i] = own["trial_id"][0]
             grasps.append(pack_grasp(own["p_AQ"][0], own["nhat_Q_A"][0]))
-        refuse_other_codes(self.path, "/grasps/trial_id", ids, len(trials))
+        validate_codes(self.path, "/grasps/trial_id", ids, len(trials))
         numbers = 6 * data.tables["grasps"]["p_TQ"].shape[1]
         packed = np.array(grasps, dtype=np.float32).reshape(-1, numbers)
         if not np.isfinite(packed).all():
@@ -692,7 +692,7 @@ class SceneRows(GraspDataset):
         return np.concatenate([colour, depth[None]])
 
 
-def refuse_other_state(path: Path, trials: Trials) -> None:
+def validate_state(path: Path, trials: Trials) -> None:
     """Raise an error if a scenes.hdf5 was made from other trials.
 
     Raises:

@@ -21,10 +21,10 @@ from drakegrasp.dataset.schema import (
     SCHEMA_VERSION,
     TRIAL_FIELDS,
     Field,
-    refuse_other_schema,
+    validate_schema,
 )
 from drakegrasp.errors import DataError
-from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
+from drakegrasp.runtime.files import atomic_hdf5, validate_seal
 
 #: Fields of `/trials` that are known for the whole dataset only; shards do not have them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
@@ -127,9 +127,9 @@ def open_shard(path: Path, header: ShardHeader, *, verify_seal: bool = True) -> 
             the reason.
     """
     if verify_seal:
-        refuse_broken_seal(path)
+        validate_seal(path)
     with opened(path, "a complete shard", again=not verify_seal) as file:
-        refuse_other_schema(path, file.attrs.get("schema_version"))
+        validate_schema(path, file.attrs.get("schema_version"))
 
         # Check the identity: a file may have been copied to the path of another unit.
         own = ShardHeader(**{name: file.attrs[name] for name in header.stored})

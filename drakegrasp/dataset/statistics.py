@@ -105,7 +105,7 @@ def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     return True
 
 
-def refuse_unassembled(out: Path) -> None:
+def validate_assembled(out: Path) -> None:
     """Reject a dataset whose files are missing, or of another state than its manifest.
 
     Raises:
@@ -253,7 +253,7 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     Raises:
         DataError: If there is no dataset, or a file cannot be read.
     """
-    refuse_unassembled(out)
+    validate_assembled(out)
     funnel = count_funnel(out)
 
     def labelled(members: type[Outcome] | type[Removal], counts: AnyArray) -> dict[str, int]:

@@ -21,7 +21,7 @@ from drakegrasp.dataset import quality
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import CAMERAS, with_derived
 from drakegrasp.errors import ConfigError, listed
-from drakegrasp.filters import NEEDED, Flags, Removal, Rule, first_removal, is_outlier
+from drakegrasp.filters import NEEDED, Filter, Flags, Removal, first_removal, is_outlier
 from drakegrasp.frames import Array, invert_pose, unpack_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.registry import own_class, run_own
@@ -153,27 +153,27 @@ def normal_angle(t: Table, camera: CameraConfig) -> Array:
 
 
 @_derived(*quality.COLUMNS)
-def suspicion(t: Table, camera: CameraConfig) -> Array:
-    """Return the score (n,) of `quality.suspicion`."""
-    return quality.suspicion(t).score
+def anomaly(t: Table, camera: CameraConfig) -> Array:
+    """Return the score (n,) of `quality.anomaly`."""
+    return quality.anomaly(t).score
 
 
 @_derived(*quality.COLUMNS)
 def penetration(t: Table, camera: CameraConfig) -> Array:
     """Return the largest depth (n,) of the object in a fingertip [m]."""
-    return quality.suspicion(t).values["penetration"]
+    return quality.anomaly(t).values["penetration"]
 
 
 @_derived(*quality.COLUMNS)
 def imbalance(t: Table, camera: CameraConfig) -> Array:
     """Return the imbalance (n,) of the fingertips' forces, as a fraction of the weight."""
-    return quality.suspicion(t).values["imbalance"]
+    return quality.anomaly(t).values["imbalance"]
 
 
 @_derived(*quality.COLUMNS)
 def normal_sum(t: Table, camera: CameraConfig) -> Array:
     """Return the length (n,) of the sum of the contact normals, per finger."""
-    return quality.suspicion(t).values["normal_sum"]
+    return quality.anomaly(t).values["normal_sum"]
 
 
 @_derived("X_OG")
@@ -280,9 +280,9 @@ def _own_filter(name: str, config: FilterConfig) -> _Keep:
     if is_own_class(name):
         found = own_class(name, config.code, key=_OWN, method="keep", takes=("successes",))
         return lambda successes: found().keep(successes)
-    rule = registry.find("rules", name)
-    if not isinstance(rule, Rule):
-        raise ConfigError(f"rules: {name} must be a Rule, got {type(rule).__name__}")
+    rule = registry.find("filters", name)
+    if not isinstance(rule, Filter):
+        raise ConfigError(f"filters: {name} must be a Filter, got {type(rule).__name__}")
 
     def keep(successes: Table) -> Flags:
         if missing := [column for column in rule.needs if not successes.has(column)]:

@@ -28,7 +28,7 @@ from drakegrasp.dataset.hdf5 import (
     read_codes,
     read_columns,
     read_texts,
-    refuse_other_codes,
+    validate_codes,
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, SPLITS, TRIAL_FIELDS
@@ -285,7 +285,7 @@ class Trials:
         for name, codes in (("outcome", list(Outcome)), ("object", len(self.objects["name"]))):
             if name in stored:
                 place = f"/trials/{name}"
-                refuse_other_codes(self._file, place, table[name], codes, near.start)
+                validate_codes(self._file, place, table[name], codes, near.start)
         columns = dict(table[rows - near.start])
         for name in ("removal", "split"):
             if name in names:

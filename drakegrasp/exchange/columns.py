@@ -15,7 +15,7 @@ import numpy as np
 
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line, one_line
-from drakegrasp.foreign_files import read_npz, refuse_irregular
+from drakegrasp.foreign_files import read_npz, validate_regular
 from drakegrasp.frames import Array, as_numbers
 
 #: Suffixes of HDF5 files, of all files of several arrays, and of files that can hold contacts.
@@ -44,7 +44,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         if path.suffix.lower() == ".npz":
             return read_npz(path, MOST_BYTES)
         with open_hdf5(path) as file:
-            refuse_large(sum(getattr(item, "nbytes", 0) for item in file.values()))
+            validate_size(sum(getattr(item, "nbytes", 0) for item in file.values()))
             return {name: _dataset(item) for name, item in file.items()}
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
         raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
@@ -56,7 +56,7 @@ def _dataset(item: h5py.Dataset | h5py.Group) -> Any:
     return item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
 
 
-def refuse_large(size: int) -> None:
+def validate_size(size: int) -> None:
     """Reject arrays larger than any file of postures; a small file can unpack to terabytes."""
     if size > MOST_BYTES:
         raise GraspError(f"arrays must be at most {MOST_BYTES:.0e} bytes, got {size:.1e}")
@@ -72,7 +72,7 @@ def read_numbers(path: Path) -> Array:
         GraspError: If the file cannot be read, or does not hold real numbers.
     """
     try:
-        refuse_irregular(path)
+        validate_regular(path)
         with path.open("rb") as file:
             array = np.lib.format.read_array(file, allow_pickle=False)
     # A damaged header may state any size, and then NumPy raises a MemoryError.

@@ -21,7 +21,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import NO_PRESHAPE, SPLITS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, DrakegraspError, one_line
-from drakegrasp.foreign_files import refuse_address
+from drakegrasp.foreign_files import validate_local
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel, load_object
@@ -54,7 +54,7 @@ def export_dataset(
         DiskFullError: If the disk is full; no files are left behind.
     """
     # A dataset that cannot be read is rejected before anything is written.
-    refuse_address(directory)
+    validate_local(directory)
     out, directory = Path(out), Path(directory)
     if not registry.is_known("exporters", form):
         known = ", ".join(registry.names("exporters"))

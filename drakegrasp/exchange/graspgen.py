@@ -19,7 +19,7 @@ import numpy as np
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, listed, one_line
 from drakegrasp.exchange.attempts import is_graspgen
-from drakegrasp.exchange.columns import refuse_large
+from drakegrasp.exchange.columns import validate_size
 from drakegrasp.foreign_files import read_json
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import Hand
@@ -72,7 +72,7 @@ def read_graspgen_hdf5(path: Path, hand: Hand) -> dict[str, Any] | None:
         file["objects"].visititems(
             lambda _, item: groups.append(item) if "pred_grasps" in _names(item) else None
         )
-        refuse_large(sum(group["pred_grasps"].nbytes for group in groups))
+        validate_size(sum(group["pred_grasps"].nbytes for group in groups))
 
         # What the groups of the objects and the file as a whole state.
         try:

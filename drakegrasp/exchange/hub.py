@@ -28,7 +28,7 @@ from PIL import Image
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
+from drakegrasp.dataset.scenes import SceneDataset, validate_state
 from drakegrasp.dataset.schema import (
     CAMERAS,
     CONVENTIONS,
@@ -271,7 +271,7 @@ def scene_tables(out: Path) -> list[HubTable]:
     if not os.path.lexists(path):
         return []
     data = SceneDataset(path, points=None)
-    refuse_other_state(path, Trials(out))
+    validate_state(path, Trials(out))
     kinds = (("views", "views", VIEW_COLUMNS), ("scene_grasps", "grasps", GRASP_COLUMNS))
     return [_scene_table(data, *kind, split) for kind in kinds for split in SPLITS]
 

@@ -23,7 +23,7 @@ from drakegrasp.dataset.schema import CAMERAS, NO_PRESHAPE, sizes
 from drakegrasp.dataset.shards import ShardHeader, trial_columns
 from drakegrasp.dataset.successes import successes_of
 from drakegrasp.errors import DataError
-from drakegrasp.filters import RULES, Removal
+from drakegrasp.filters import FILTERS, Removal
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import load_hand
@@ -318,7 +318,7 @@ _OF_PICTURES = {"seen", "depth_variance"}
 
 def unjudged(rules: FilterConfig) -> tuple[Removal, ...]:
     """Return the enabled filters that a verdict cannot apply."""
-    of_pictures = (rule for rule in RULES if rule.is_on(rules) and {*rule.needs} & _OF_PICTURES)
+    of_pictures = (rule for rule in FILTERS if rule.is_on(rules) and {*rule.needs} & _OF_PICTURES)
     others = {Removal.OUTLIER: rules.outlier_sigma > 0.0, Removal.OWN: bool(rules.own)}
     return (
         *(rule.removal for rule in of_pictures),

@@ -70,7 +70,7 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
     with build_lock(out) as dead, disk_full_named(out):
         known = claim_directory(out, config)
         if known is not None:
-            _refuse_missing(known, names, out)
+            _validate_complete(known, names, out)
         config = carry_hand(out, config, known.config.hand if known else None)
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
         if swept := [str(path.relative_to(out)) for path in sweep_temporary(out)]:
@@ -102,7 +102,7 @@ def _manifest(config: Config, known: Manifest | None) -> Manifest:
     )
 
 
-def _refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
+def _validate_complete(known: Manifest, names: Collection[str], out: Path) -> None:
     """Check that all meshes from which a dataset was built are given to continue it.
 
     Raises:

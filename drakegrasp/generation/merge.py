@@ -69,7 +69,7 @@ def merge(
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise DataError(f"{into}: must be a new or empty directory, got one that is in use")
     manifests = {out: with_postprocessing(_read_complete(out), overrides) for out in outs}
-    _refuse_differences(manifests)
+    _validate_comparable(manifests)
     manifest = _merged_manifest(manifests)
     own_filters(manifest.config.filters)
 
@@ -92,7 +92,7 @@ def _read_complete(out: Path) -> Manifest:
     return manifest
 
 
-def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
+def _validate_comparable(manifests: Mapping[Path, Manifest]) -> None:
     """Check that the labels of the datasets can be compared.
 
     Raises:

@@ -13,7 +13,7 @@ from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import ConfigError, MeshError, listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.attempts import Attempts
-from drakegrasp.simulation.candidates import refuse_samplers
+from drakegrasp.simulation.candidates import validate_samplers
 from drakegrasp.simulation.drive import drive_of
 
 #: Name that requests the built-in objects instead of a directory of meshes.
@@ -45,7 +45,7 @@ def build_config(config: Config, postures: Attempts | None = None) -> Config:
     # The hand, and classes that are not of this package.
     drive_of(load_hand(config.hand_source), config.lift)
     if rules.postures is None:
-        refuse_samplers(config)
+        validate_samplers(config)
     own_filters(config.filters)
     return config
 
@@ -68,7 +68,7 @@ def _with_postures(config: Config, postures: Attempts | None) -> Config:
     return config.model_copy(update={"candidates": rules.model_copy(update=changed)})
 
 
-def refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
+def validate_known(only: Sequence[str], names: Sequence[str]) -> None:
     """Check that each name is the name of an object.
 
     Raises:

@@ -52,7 +52,7 @@ from drakegrasp.hand.parsing import (
     joint_slides,
     make_chains,
     moving_joint,
-    refuse_joints_of_others,
+    validate_own_joints,
 )
 from drakegrasp.hand.shapes import pad_surfaces
 
@@ -239,7 +239,7 @@ def _load(path: Path, stamp: tuple[int, ...]) -> Hand:
                 raise HandError(f"preshapes.{i}: {error}") from None
         names = tuple(preshape.name for preshape in described.preshapes)
         hand = replace(hand, preshapes=tuple(shaped), preshape_names=names)
-        _refuse_empty_pads(hand)
+        _validate_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
     return hand
@@ -276,7 +276,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
     limits = np.array(
         [(j.position_lower_limit(), j.position_upper_limit()) for j in moving.values()]
     ).reshape(-1, 2)
-    _refuse_other_kinds(described, moving)
+    _validate_kinds(described, moving)
     for joint, (lower, upper) in zip(moving, limits, strict=True):
         position = described.preshape.get(joint, lower)
         if not lower <= position <= upper:
@@ -306,7 +306,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
                 f"got {finger.closing_joint!r}"
             )
         chains.append(chain)
-    refuse_joints_of_others(described, chains)
+    validate_own_joints(described, chains)
 
     return Hand(
         name=name,
@@ -337,7 +337,7 @@ def _pose(rpy_deg: Sequence[float], p: Sequence[float]) -> Array:
     return make_pose(RollPitchYaw(np.deg2rad(rpy_deg)).ToRotationMatrix().matrix(), p)
 
 
-def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:
+def _validate_kinds(described: HandFile, joints: dict[str, Any]) -> None:
     """Reject a closing joint that slides without a force limit or turns without a torque limit."""
     for i, finger in enumerate(described.driven_fingers()):
         slides = joint_slides(joints[finger.closing_joint])
@@ -358,7 +358,7 @@ def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:
             raise HandError(f"spread.joints.{n}: must be a joint that turns, got {name!r}")
 
 
-def _refuse_empty_pads(hand: Hand) -> None:
+def _validate_pads(hand: Hand) -> None:
     """Reject a pad region that contains no part of its fingertip's surface: it could not touch."""
     if not any(finger.pad_region for finger in hand.fingers):
         return

@@ -26,7 +26,7 @@ def hand_file(source: HandSource) -> Path:
         HandError: If there is no such file, or the path of a dataset's hand leads elsewhere.
     """
     if isinstance(source, CarriedHand):
-        refuse_outside(source.path, source.path.parent)
+        validate_inside(source.path, source.path.parent)
         return source.path
     path = MODELS / f"{source}_hand.yaml"
     if source in hand_names() and not path.exists():
@@ -39,7 +39,7 @@ def hand_file(source: HandSource) -> Path:
     return path
 
 
-def refuse_outside(path: Path, folder: Path) -> None:
+def validate_inside(path: Path, folder: Path) -> None:
     """Reject a path that is not a plain file of a folder; the folder may be a stranger's.
 
     Raises:

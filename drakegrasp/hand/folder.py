@@ -26,7 +26,7 @@ from drakegrasp.config import CarriedHand, Config, HandSource
 from drakegrasp.errors import DataError, HandError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.hand.file_format import hand_keys
-from drakegrasp.hand.files import REFERENCES, hand_file, refuse_outside
+from drakegrasp.hand.files import REFERENCES, hand_file, validate_inside
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 
 #: Maximum total size [byte], YAML size [byte] and number of a hand's files; a stranger may have
@@ -170,7 +170,7 @@ class HandFolder:
         if "\0" in str(path):
             return False
         if self.is_carried and os.path.lexists(path):
-            refuse_outside(path, self.root)
+            validate_inside(path, self.root)
         self.asked[path] = path.is_file()
         if not self.asked[path]:
             if path.exists() and not path.is_dir():  # Drake would read it without end
@@ -306,7 +306,7 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
     content = hand_folder(config.hand_source)
     carried = CarriedHand(path=path, digest=content.digest)
     if known is None and not isinstance(config.hand_source, CarriedHand):
-        _refuse_other_files(content, path)
+        _validate_files(content, path)
     if not _is_there(carried):
         with disk_full_named(out):
             _write(content, path)
@@ -326,7 +326,7 @@ def _is_there(carried: CarriedHand) -> bool:
         return False
 
 
-def _refuse_other_files(content: HandFolder, path: Path) -> None:
+def _validate_files(content: HandFolder, path: Path) -> None:
     """Reject a folder that contains user files, because a build replaces and removes its content.
 
     Args:

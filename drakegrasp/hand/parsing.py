@@ -224,7 +224,7 @@ def declared_mimics(root: Element) -> list[Mimic]:
     return found
 
 
-def refuse_impossible(root: Element) -> None:
+def validate_joints(root: Element) -> None:
     """Reject impossible limits and mimics of URDF or SDFormat: a parser's error lacks the reason.
 
     Raises:
@@ -238,7 +238,7 @@ def refuse_impossible(root: Element) -> None:
                 _number(_value(tag, key, default), f"{key} limit")
                 for key, default in (("lower", "-inf"), ("upper", "inf"))
             )
-            refuse_limits(name, lower, upper)
+            validate_limits(name, lower, upper)
     for mimic in declared_mimics(root):
         if mimic.leader not in joints:
             raise HandError(
@@ -246,7 +246,7 @@ def refuse_impossible(root: Element) -> None:
             )
 
 
-def refuse_limits(name: str, lower: float, upper: float) -> None:
+def validate_limits(name: str, lower: float, upper: float) -> None:
     """Reject a joint whose lower limit is above its upper limit.
 
     Raises:
@@ -293,7 +293,7 @@ def moving_joint(joint: Any) -> bool:
     return isinstance(joint, RevoluteJoint | PrismaticJoint)
 
 
-def refuse_other_joint(joint: Any) -> None:
+def validate_joint(joint: Any) -> None:
     """Reject a joint that is not revolute, prismatic or fixed."""
     if not (moving_joint(joint) or isinstance(joint, WeldJoint)):
         raise HandError(
@@ -321,7 +321,7 @@ def find_joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Any
     """
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
     for joint in joints:
-        refuse_other_joint(joint)
+        validate_joint(joint)
         if joint.parent_body().index() == plant.world_body().index():
             raise HandError(
                 f"model: joint {joint.name()!r} must join two links of the hand, got the world"
@@ -419,7 +419,7 @@ def _extended(chain: Chain, joint: Any, drives: Mapping[str, JointDrive]) -> Cha
     )
 
 
-def refuse_joints_of_others(described: HandFile, chains: Sequence[Chain]) -> None:
+def validate_own_joints(described: HandFile, chains: Sequence[Chain]) -> None:
     """Reject a finger that moves a joint of another finger; it may move joints outside all fingers.
 
     Raises:

@@ -77,7 +77,7 @@ def load_surface(path: Path) -> tuple[Array, Faces]:
         MeshError: If the file cannot be read or contains no finite triangles.
     """
     vertices, faces = join_scene(_parse_scene(path.name, read_bytes(path)))
-    refuse_faulty(vertices, faces, path.name)
+    validate_triangles(vertices, faces, path.name)
     return vertices, faces
 
 
@@ -138,7 +138,7 @@ def _parse_scene(name: str, content: bytes) -> trimesh.Scene:
     try:
         declared = declare(content)
         scene = _read_by_trimesh(suffix[1:], content)
-        _refuse_difference(scene, declared)
+        _validate_declared(scene, declared)
     except ImportError as error:
         missing = "pycollada" if suffix == ".dae" else one_line(error)
         raise MeshError(f"{name}: needs `pip install {missing}`, or another format") from None
@@ -158,7 +158,7 @@ def _read_by_trimesh(kind: str, content: bytes) -> trimesh.Scene:
         )
 
 
-def _refuse_difference(scene: trimesh.Scene, declared: Declared) -> None:
+def _validate_declared(scene: trimesh.Scene, declared: Declared) -> None:
     """Reject a file that declares another surface than trimesh returned.
 
     Raises:
@@ -251,14 +251,14 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
     Raises:
         MeshError: If there are no triangles, or if vertices are missing or not finite.
     """
-    refuse_faulty(vertices, faces, name)
+    validate_triangles(vertices, faces, name)
     vertices, faces = weld(vertices, faces)
     if not len(faces):
         raise MeshError(f"{name}: must hold triangles, got only degenerate faces")
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def refuse_faulty(vertices: Array, faces: Faces, name: str) -> None:
+def validate_triangles(vertices: Array, faces: Faces, name: str) -> None:
     """Reject arrays that are not a mesh, see `clean_triangles`.
 
     Raises:

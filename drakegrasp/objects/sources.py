@@ -185,7 +185,7 @@ def find_meshes(
     """
     # The mesh files.
     directory = Path(directory)
-    refuse_units(units)
+    validate_units(units)
     try:
         paths = [
             path
@@ -202,7 +202,7 @@ def find_meshes(
 
     # The stems of the files; some file systems store é as two characters, the manifest as one.
     stems = {path: unicodedata.normalize("NFC", path.stem) for path in sorted(paths)}
-    _refuse_twins(directory, stems)
+    _validate_distinct(directory, stems)
 
     # The manifest, which may only refer to these files.
     if manifest is None and (directory / MANIFEST_NAME).is_file():
@@ -217,7 +217,7 @@ def find_meshes(
         )
 
     sources = [_source(path, stem, table, units) for path, stem in stems.items()]
-    _refuse_twins(directory, {source.path: source.name for source in sources})
+    _validate_distinct(directory, {source.path: source.name for source in sources})
     return sorted(sources, key=lambda source: source.name)
 
 
@@ -228,7 +228,7 @@ def find_mesh(path: str | Path, *, units: str = "m") -> MeshSource:
         MeshError: If the file is not a mesh file, or the manifest beside it is invalid.
     """
     path = Path(path)
-    refuse_units(units)
+    validate_units(units)
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         got = repr(path.suffix) if path.is_file() else "none"
         raise MeshError(f"{path}: must be a mesh file ({', '.join(SUFFIXES)}), got {got}")
@@ -250,7 +250,7 @@ def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
     return MeshSource(path=path.absolute(), scale=scale, **(usual | said))
 
 
-def refuse_units(units: str) -> None:
+def validate_units(units: str) -> None:
     """Raise an error for an unknown unit of length.
 
     Raises:
@@ -260,7 +260,7 @@ def refuse_units(units: str) -> None:
         raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
 
 
-def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
+def _validate_distinct(directory: Path, names: dict[Path, str]) -> None:
     for name, count in Counter(names.values()).items():
         if count > 1:
             twins = ", ".join(path.name for path, other in names.items() if other == name)

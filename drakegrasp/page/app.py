@@ -191,7 +191,7 @@ class Inspection:
                 self._fixed[kind] = Scenes(self._scenes, self.snapshot)
             return self._fixed[kind]
 
-    def refuse_replaced(self) -> None:
+    def validate_unchanged(self) -> None:
         """Raise an error if a file is no longer the one that was read.
 
         Raises:
@@ -320,9 +320,9 @@ def make_app(inspection: Inspection) -> Starlette:
     def get(path: str, show: Answer) -> Route:
         async def endpoint(request: Request) -> Response:
             name = request.path_params.get("name", "")
-            inspection.refuse_replaced()
+            inspection.validate_unchanged()
             answer = await run_in_threadpool(show, inspection, name, request.query_params)
-            inspection.refuse_replaced()
+            inspection.validate_unchanged()
             return answer
 
         return Route(path, endpoint)
@@ -330,7 +330,7 @@ def make_app(inspection: Inspection) -> Starlette:
     def post(path: str, change: Callable[[Inspection, dict[str, Any]], Response]) -> Route:
         async def endpoint(request: Request) -> Response:
             content = await _content(request, inspection.token)
-            inspection.refuse_replaced()
+            inspection.validate_unchanged()
             return await run_in_threadpool(change, inspection, content)
 
         return Route(path, endpoint, methods=["POST"])

@@ -31,14 +31,14 @@ from drakegrasp.simulation.attempt import Source
 
 #: Features of an attempt for sorting, with their display.
 QUANTITIES = {
-    "suspicion": Shown("suspicion", digits=2),
+    "anomaly": Shown("anomaly", digits=2),
     **{part.name: part.shown for part in PARTS},
 }
 #: Texts of two choices of the split: all samples, and all attempts that are not samples.
 SPLIT_NAMES = {"samples": "any sample", "none": "no sample"}
 #: The removal that no success has: successes kept by the filters are called samples.
 KEPT = ("removal", Removal.KEPT.label)
-#: Maximum number of reasons of suspicion on a card, and the smallest part that is a reason.
+#: Maximum number of reasons of anomaly on a card, and the smallest part that is a reason.
 REASONS, REASON_SHARE = 2, 0.75
 
 
@@ -159,7 +159,7 @@ class Attempts(Gallery):
                     # Other attempts have no images.
                     "dots": contact_dots(snapshot, row, "oto") if sample else [],
                     "words": words_of(snapshot, i),
-                    "suspicion": _text(snapshot, "suspicion", i),
+                    "anomaly": _text(snapshot, "anomaly", i),
                     "reasons": _reasons(snapshot, i),
                     "decision": self.decisions.of(snapshot.key(i)),
                 }
@@ -199,7 +199,7 @@ class Attempts(Gallery):
             "success": outcome is Outcome.SUCCESS,
             "decision": self.decisions.of(key),
             "views": views,
-            "score": _text(snapshot, "suspicion", i),
+            "score": _text(snapshot, "anomaly", i),
             "parts": [(part.shown.title, _text(snapshot, part.name, i)) for part in PARTS],
             "facts": _facts(snapshot, i, row),
             "scene": attempt_scene(snapshot, i, row, hand),
@@ -227,7 +227,7 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
 
 
 def _reasons(snapshot: Snapshot, i: int) -> list[str]:
-    """Return the largest parts of an attempt's suspicion, as text."""
+    """Return the largest parts of an attempt's anomaly, as text."""
     shares = [(snapshot.table[part.name][i] / part.scale, part.name) for part in PARTS]
     large = sorted((s for s in shares if s[0] >= REASON_SHARE), reverse=True)[:REASONS]
     # A contact without a normal has no normal angle, so this part is infinite.

@@ -18,7 +18,7 @@ import numpy as np
 from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE, model_path
-from drakegrasp.dataset.quality import COLUMNS, PARTS, suspicion
+from drakegrasp.dataset.quality import COLUMNS, PARTS, anomaly
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
@@ -27,8 +27,8 @@ from drakegrasp.hand.folder import carried_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.table import AnyArray, Table, join
 
-#: Quantities for sorting, besides the parts of the suspicion.
-EXTRA = ("suspicion",)
+#: Quantities for sorting, besides the parts of the anomaly.
+EXTRA = ("anomaly",)
 FEATURES = (*EXTRA, *(part.name for part in PARTS))
 #: Columns that identify an attempt.
 IDENTITY = ("object", "candidate", "standoff_index")
@@ -64,8 +64,8 @@ def _columns_of(columns: Mapping[str, AnyArray]) -> Table:
     # Most attempts never close the hand; only those that do have features.
     closed = np.isfinite(columns["time_close"])
     few = {name: values[closed] for name, values in columns.items()}
-    doubts = suspicion(few)
-    found = {"suspicion": doubts.score}
+    doubts = anomaly(few)
+    found = {"anomaly": doubts.score}
 
     # A value that a contact without a normal lacks counts as the largest part, so it is infinite.
     found |= {

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from drakegrasp.arithmetic import multiply, norm
-from drakegrasp.dataset.hdf5 import differences, opened, read_codes, refuse_first
+from drakegrasp.dataset.hdf5 import differences, opened, read_codes, validate_file
 from drakegrasp.dataset.reader import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import (
     CAMERAS,
@@ -23,7 +23,7 @@ from drakegrasp.dataset.schema import (
     VERIFICATION_FIELDS,
     Field,
     Shown,
-    refuse_other_schema,
+    validate_schema,
 )
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
@@ -104,8 +104,8 @@ class Predictions(Gallery):
             group = file.get(GROUP)
             if not isinstance(group, h5py.Group) or not all(name in group for name in NEEDED):
                 raise DataError(f"{path}: must be a result file of drakegrasp verify, got another")
-            refuse_other_schema(path, file.attrs.get("schema_version"))
-            refuse_first(path, differences(file, {GROUP: _MAY_LACK}))
+            validate_schema(path, file.attrs.get("schema_version"))
+            validate_file(path, differences(file, {GROUP: _MAY_LACK}))
             names = group["object"].asstr()[:].tolist()
             self.rows = _matched(path, file, snapshot, names)
             outcome = read_codes(group["outcome"], list(Outcome))

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import refuse_other_codes
-from drakegrasp.dataset.scenes import SceneDataset, refuse_other_state
+from drakegrasp.dataset.hdf5 import validate_codes
+from drakegrasp.dataset.scenes import SceneDataset, validate_state
 from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
@@ -56,12 +56,12 @@ class Scenes(Gallery):
     }
 
     def __init__(self, path: Path, snapshot: Snapshot) -> None:
-        refuse_other_state(path, snapshot.trials)
+        validate_state(path, snapshot.trials)
         data = SceneDataset(path, points=None)
         scenes, grasps, views = (data.tables[name] for name in ("scenes", "grasps", "views"))
-        refuse_other_codes(path, "/grasps/outcome", grasps["outcome"], list(Outcome))
-        refuse_other_codes(path, "/grasps/trial_id", grasps["trial_id"], snapshot.table.count)
-        refuse_other_codes(path, "/views/kind", views["kind"], len(VIEW_KINDS))
+        validate_codes(path, "/grasps/outcome", grasps["outcome"], list(Outcome))
+        validate_codes(path, "/grasps/trial_id", grasps["trial_id"], snapshot.table.count)
+        validate_codes(path, "/views/kind", views["kind"], len(VIEW_KINDS))
         if not np.isfinite(scenes["X_TO"]).all():
             raise DataError(f"{path}: /scenes/X_TO must be finite, got other numbers")
         if others := set(data.names) - set(snapshot.names):

@@ -226,12 +226,12 @@ def _add_object(spec: mujoco.MjSpec, thing: ObjectFolder, density: float) -> Non
     body.add_freejoint(name="obj_freejoint")
     for number, path in enumerate(thing.parts):
         name = f"object_part_{number}"
-        _refuse_no_mesh(path)
+        _validate_mesh(path)
         spec.add_mesh(name=name, file=str(path.resolve()), scale=[thing.scale] * 3)
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=density)
 
 
-def _refuse_no_mesh(path: Path) -> None:
+def _validate_mesh(path: Path) -> None:
     """Raise an error if MuJoCo cannot read a file as a mesh."""
     alone = mujoco.MjSpec()
     alone.add_mesh(name="part", file=str(path.resolve()))

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 import h5py
 
 from drakegrasp.errors import DataError, DiskFullError
-from drakegrasp.foreign_files import LARGEST_SEALED, refuse_irregular
+from drakegrasp.foreign_files import LARGEST_SEALED, validate_regular
 from drakegrasp.runtime.environment import host_label, is_running
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def new_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
                 yield file
         finally:
             # Other errors would follow from this one.
-            patient.refuse_failure()
+            patient.validate_success()
     if sealed:
         seal(path)
 
@@ -178,7 +178,7 @@ class _PatientFile(FileIO):
             self._failure = error
             return size or 0
 
-    def refuse_failure(self) -> None:
+    def validate_success(self) -> None:
         """Raise the error of the first write that failed."""
         if self._failure is not None:
             raise self._failure
@@ -199,28 +199,26 @@ def read_seal(path: Path) -> bytes:
         DataError: If the file cannot be read.
     """
     try:
-        refuse_irregular(path)
+        validate_regular(path)
         with path.open("rb", buffering=0) as file:
             return file.read(SEAL_SIZE)
     except OSError as error:
         raise DataError(f"{path}: must be a complete shard, got none ({error.strerror})") from None
 
 
-def refuse_broken_seal(
-    path: Path, what: str = "shard", largest: int | None = LARGEST_SEALED
-) -> None:
+def validate_seal(path: Path, what: str = "shard", largest: int | None = LARGEST_SEALED) -> None:
     """Raise an error if any bit of a sealed file has changed.
 
     Args:
         path: Path of the file.
         what: What the file is, for the error message.
-        largest: As for `refuse_irregular`.
+        largest: As for `validate_regular`.
 
     Raises:
         DataError: If the file is damaged or missing.
     """
     try:
-        refuse_irregular(path, largest)
+        validate_regular(path, largest)
         with path.open("rb") as file:
             stored = file.read(SEAL_SIZE)
             intact = stored == _seal_of(file)

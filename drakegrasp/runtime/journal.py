@@ -45,7 +45,7 @@ from typing import Any
 
 from filelock import lock_descriptor
 
-from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
+from drakegrasp.foreign_files import LARGEST_TEXT, validate_regular
 from drakegrasp.runtime.files import temporary_name
 
 #: Number of successive crashes in one step after which the step is not tried again: one crash may
@@ -278,7 +278,7 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     if path.is_symlink():
         return history  # it will be replaced
     try:
-        refuse_irregular(path, LARGEST_TEXT)
+        validate_regular(path, LARGEST_TEXT)
         with path.open("r+b") as file:  # NFS locks only files that are open for writing
             if not _lock(file.fileno()):
                 return None

@@ -115,7 +115,7 @@ def score(
             training rows are of another camera or hand, or the other method has the same name as
             the predictions.
     """
-    _refuse_other_train(data, train)
+    _validate_train(data, train)
     if against is not None and (not predictions or against[0] == name):
         raise GraspError(
             "against must be beside predictions whose file has another name, got "
@@ -165,7 +165,7 @@ def score(
     return Score(card=card, seconds=times, sets=judged)
 
 
-def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
+def _validate_train(data: GraspDataset, train: GraspDataset) -> None:
     """Reject training rows whose grasps cannot be predictions for the rows to score.
 
     Raises:

@@ -28,7 +28,7 @@ from drakegrasp.frames import (
     as_numbers,
     frame_in_object,
     make_pose,
-    refuse_other_frames,
+    validate_frame,
 )
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
@@ -328,7 +328,7 @@ def make_attempts(
     order = list(joint_order(hand) if joints is None else joints)
     q = _in_order(hand, count, order, {k: v for k, v in given.items() if v is not None}, kept)
     X_AG = hand.palm_in(link or "")
-    _refuse_table(count, frame, X_TC)
+    _validate_table(count, frame, X_TC)
 
     # Columns that every row must have and columns that a row may lack; `bad` has a row's fault.
     bad = [""] * count if invalid is None else list(invalid)
@@ -427,10 +427,10 @@ def read_confidence(stated: Any, shape: tuple[int, ...], invalid: Sequence[str] 
     return confidence
 
 
-def _refuse_table(count: int, frame: str, X_TC: npt.ArrayLike | None) -> None:
+def _validate_table(count: int, frame: str, X_TC: npt.ArrayLike | None) -> None:
     if not count:
         raise GraspError("postures must be at least one row, got none")
-    refuse_other_frames(frame, TABLE_FRAMES)
+    validate_frame(frame, TABLE_FRAMES)
     if (X_TC is None) == (frame == "camera"):
         raise GraspError("X_TC must be given with the frame camera, and only then")
 

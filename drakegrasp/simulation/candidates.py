@@ -182,7 +182,7 @@ class Drawing:
         methods = [method for (_, method), _ in turns]
         for method in {of for of in methods if _source(of) is Source.OWN}:
             of_method = [of == method for of in methods]
-            _refuse_far(method, model, poses[of_method], distance[of_method])
+            _validate_palms(method, model, poses[of_method], distance[of_method])
         preshapes = [-1 if shape.preshape is None else shape.preshape for _, shape in palms]
         return Candidates(
             X_OG=poses,
@@ -194,7 +194,7 @@ class Drawing:
         )
 
 
-def _refuse_far(method: str, model: ObjectModel, poses: Array, distance: Array) -> None:
+def _validate_palms(method: str, model: ObjectModel, poses: Array, distance: Array) -> None:
     """Reject a user-defined sampler whose palms are all far away and do not face the object.
 
     Raises:
@@ -226,7 +226,7 @@ def sampler_class(method: str, config: CandidateConfig) -> Callable[..., Sampler
     return found
 
 
-def refuse_samplers(config: Config) -> None:
+def validate_samplers(config: Config) -> None:
     """Reject samplers that cannot be used.
 
     Raises:

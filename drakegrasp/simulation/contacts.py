@@ -8,12 +8,12 @@ of the patches. Its normal is the pressure-weighted mean of the face normals and
 object. Both belong to the rigid object's surface, because a patch between a rigid and a compliant
 body is a piece of the rigid surface.
 
-`Way` computes how close the hand comes to the table: the smallest height of its collision shapes
-above the table's top on the way between the observed states of the scene. It only reads positions,
-so the simulation is the same with and without it. Between two observations, each joint moves in one
-direction. A link depends only on the joints of its own finger, which move in fixed ratios. A
-straight line from state to state in joint space therefore passes through all postures of each
-finger, no matter which finger was faster.
+`ClearanceMonitor` computes how close the hand comes to the table: the smallest height of its
+collision shapes above the table's top between the observed states of the scene. It only reads
+positions, so the simulation is the same with and without it. Between two observations, each joint
+moves in one direction. A link depends only on the joints of its own finger, which move in fixed
+ratios. A straight line from state to state in joint space therefore passes through all postures of
+each finger, no matter which finger was faster.
 """
 
 from __future__ import annotations
@@ -345,7 +345,7 @@ def _body_of(scene: ObjectScene, geometry_id: object) -> BodyIndex:
 STEP = 0.02
 
 
-class Way:
+class ClearanceMonitor:
     """The observed states of a hand in one attempt; none if the clearance is not measured."""
 
     def __init__(self, rules: CloseConfig) -> None:

@@ -27,8 +27,8 @@ from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transfor
 from drakegrasp.hand.finger_sweep import pad_points
 from drakegrasp.simulation.construction import copy_materials
 from drakegrasp.simulation.contacts import (
+    ClearanceMonitor,
     Contacts,
-    Way,
     bodies_on_object,
     hand_bodies,
     read_contacts,
@@ -107,7 +107,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     # `scene` takes fine steps; `current` is the scene that takes the steps that are needed now.
     now, current, monitor, used = start, scene, _Monitor(scene), [scene]
     slip_released, turn_released, certain, moved = 0.0, 0.0, False, False
-    way = Way(config.close)
+    way = ClearanceMonitor(config.close)
     way.look(scene)
     try:
         # Free the object in the hand; later the wrist moves to its target.

@@ -23,7 +23,7 @@ from drakegrasp.frames import Array, make_pose, read_pose, transform_points
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.mesh.loading import clean_triangles
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
-from drakegrasp.objects.sources import UNITS, find_mesh, refuse_units
+from drakegrasp.objects.sources import UNITS, find_mesh, validate_units
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.settle import settle
 
@@ -100,14 +100,14 @@ def place_object(
     config = config_for(mesh, config)
     if hand is not None:
         config = override_config(config, [], hand=str(hand))
-    refuse_units(units or "m")
+    validate_units(units or "m")
 
     # Prepare the object, unless it is already prepared.
     if isinstance(mesh, Placed):
         if units is not None:
             raise MeshError(f"units must be None for a prepared object, got {units!r}")
         if isinstance(mesh, PlacedObject):
-            refuse_other_objects(config, mesh.config, "as the object was placed with")
+            validate_same_objects(config, mesh.config, "as the object was placed with")
         model, known = mesh.model, np.asarray(mesh.X_TO)
     elif isinstance(mesh, trimesh.Trimesh):
         model, known = _model_of(mesh, units or "m", config), None
@@ -135,11 +135,11 @@ def config_for(mesh: object, config: Config | None) -> Config:
     """
     if config is None:
         return mesh.config if isinstance(mesh, PlacedObject) else load_config()
-    refuse_no_config(config)
+    validate_config(config)
     return config
 
 
-def refuse_no_config(config: object) -> None:
+def validate_config(config: object) -> None:
     """Reject anything but a `Config`, such as the name of a preset.
 
     Raises:
@@ -151,7 +151,7 @@ def refuse_no_config(config: object) -> None:
         )
 
 
-def refuse_other_objects(config: Config, known: Config, must_be: str) -> None:
+def validate_same_objects(config: Config, known: Config, must_be: str) -> None:
     """Reject a configuration that prepares and drops objects differently from a known one.
 
     Raises:

@@ -22,7 +22,7 @@ from drakegrasp.hand.kinematics import coordinate_limits, open_together
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.placement import PlacedObject, config_for, refuse_other_objects
+from drakegrasp.simulation.placement import PlacedObject, config_for, validate_same_objects
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
@@ -97,7 +97,7 @@ def joint_order(hand: Hand) -> tuple[str, ...]:
     return position_order(hand.model, hand.palm_link)
 
 
-def refuse_misfit(posture: Posture, hand: Hand) -> None:
+def validate_posture(posture: Posture, hand: Hand) -> None:
     """Reject a posture that is not one of a hand.
 
     Raises:
@@ -245,9 +245,9 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
     if not isinstance(posture, Posture):
         raise GraspError(f"posture must be a Posture, got a {type(posture).__name__}")
     config = with_whole_lifts(config_for(placed, config))
-    refuse_other_objects(config, placed.config, "as the object was placed with")
+    validate_same_objects(config, placed.config, "as the object was placed with")
     hand = load_hand(config.hand_source)
-    refuse_misfit(posture, hand)
+    validate_posture(posture, hand)
     start = start_of(posture, hand)
     scene = cached_scene(placed.model, config.physics, config.hand_source, start.preshape)
     trial = run_attempt(scene, placed.X_TO_simulated, start, config)

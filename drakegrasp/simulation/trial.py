@@ -22,8 +22,8 @@ from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.conditions import Materials, usual_materials
 from drakegrasp.simulation.construction import set_materials
 from drakegrasp.simulation.contacts import (
+    ClearanceMonitor,
     Contacts,
-    Way,
     open_hand_collides,
     open_hand_meets,
     read_contacts,
@@ -223,7 +223,7 @@ def _close(
 ) -> TrialRecord:
     """Close the hand on the static object, and return the record; a success may lift."""
     # Start just before the fingers meet something, if geometry has found where.
-    way = Way(config.close)
+    way = ClearanceMonitor(config.close)
     way.look(scene)
     if prediction is not None:
         _place(scene, start.X_TO, attempt, prediction.closing)
@@ -274,7 +274,7 @@ def _close_fingers(
     limits: TrialLimits,
     config: Config,
     prediction: Prediction | None,
-    way: Way,
+    way: ClearanceMonitor,
 ) -> None:
     """Close the fingers on the static object until they stop or a required finger has missed it."""
     # Closing that geometry skipped counts as time; an angle beyond the last contact is a miss.
@@ -295,7 +295,9 @@ def _close_fingers(
             break
 
 
-def _follow_path(scene: Scene, limits: TrialLimits, config: Config, path: Array, way: Way) -> None:
+def _follow_path(
+    scene: Scene, limits: TrialLimits, config: Config, path: Array, way: ClearanceMonitor
+) -> None:
     """Move each joint by its own motor to the grasp and on to the squeeze, until all have stopped.
 
     The joints move in synchrony: the joint with the longest path moves at the hand's closing speed.

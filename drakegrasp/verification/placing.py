@@ -26,16 +26,16 @@ from drakegrasp.frames import (
     frame_in_object,
     invert_pose,
     read_pose,
-    refuse_other_frames,
     rotate_vectors,
     transform_points,
     unpack_pose,
+    validate_frame,
 )
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import override_config
 from drakegrasp.simulation.attempts import CONDITIONS, GraspRows
-from drakegrasp.simulation.placement import PlacedObject, refuse_no_config, refuse_other_objects
+from drakegrasp.simulation.placement import PlacedObject, validate_config, validate_same_objects
 from drakegrasp.simulation.posture import Posture
 from drakegrasp.verification.prediction import (
     FRAMES,
@@ -113,7 +113,7 @@ def contacts_on_object(
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
     """
-    refuse_other_frames(frame, FRAMES)
+    validate_frame(frame, FRAMES)
     table, config = _read(grasps, placed.config), with_whole_lifts(placed.config)
     poses = _camera_poses(X_TC, frame, len(table))
     found = []
@@ -141,7 +141,7 @@ def contacts_on_rows(
     be given for all grasps. With `drawn`, each grasp has the friction and mass that were drawn for
     its row, except for overridden values.
     """
-    refuse_other_frames(frame, FRAMES)
+    validate_frame(frame, FRAMES)
     # Read all grasps before any object, so that a wrong number is reported at once.
     table = _read(grasps, config)
     chosen = choose_rows(dataset, table.of_row if rows is None else rows, len(table))
@@ -318,14 +318,14 @@ def dataset_config(
         DataError: If the dataset cannot be used.
     """
     if config is not None:
-        refuse_no_config(config)
+        validate_config(config)
     manifest = read_manifest(dataset.path.parent)
     known, digest = manifest.config, manifest.versions.get("hand")
     if config is not None and config.hand == known.hand:
         config = config.with_hand(known.hand, known.hand_source)
     used = override_config(config or known, overrides) if overrides else config or known
     used = used if hand is None else override_config(used, [], hand=str(hand))
-    refuse_other_objects(used, known, "as in the dataset, whose objects are prepared")
+    validate_same_objects(used, known, "as in the dataset, whose objects are prepared")
     own = hand is None and used.hand == known.hand and digest is not None
     if own and (found := hand_digest(used.hand_source)) != digest:
         raise HandError(

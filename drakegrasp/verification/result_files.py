@@ -36,7 +36,7 @@ GROUP = "grasps"
 DIGITS = 6
 
 
-def refuse_unwritable(out: Path) -> None:
+def validate_writable(out: Path) -> None:
     """Reject a file that cannot be written; no file is left behind.
 
     Raises:

@@ -357,7 +357,7 @@ def read_camera(text: str, shape: tuple[int, ...]) -> Array:
                 f"{path}: camera must be for {shape[-1]} x {shape[0]} pixels, as the depth image, "
                 f"got {wide} x {high}"
             )
-        _refuse_distortion(content, path)
+        _validate_distortion(content, path)
         content = _lens_in(content)
     try:
         return read_lens(as_numbers(content, must))
@@ -365,7 +365,7 @@ def read_camera(text: str, shape: tuple[int, ...]) -> Array:
         raise GraspError(f"{path}: {one_line(error)}") from None
 
 
-def _refuse_distortion(content: dict[str, Any], path: Path) -> None:
+def _validate_distortion(content: dict[str, Any], path: Path) -> None:
     """Reject a camera file that states a distortion: points would be up to centimetres off.
 
     Raises:

@@ -25,7 +25,7 @@ from drakegrasp.vision.depth_image import cloud_from_depth
 
 pytestmark = pytest.mark.sim
 #: The views of the training split, of which there are few.
-FEW = ("--split", "train", "--count", 2, "--simulate", 0, "--quiet")
+FEW = ("--split", "train", "--count", 2, "--quiet")
 
 
 @pytest.fixture(scope="module")

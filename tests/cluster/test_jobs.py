@@ -17,7 +17,7 @@ from helpers.commands import arguments_of, run
 from helpers.golden import Golden
 from helpers.tiers import few
 
-from drakegrasp.cli.arguments import refuse_missing, refuse_no_file
+from drakegrasp.cli.arguments import validate_existing, validate_existing_file
 from drakegrasp.cluster.choice import cluster_of, describe
 from drakegrasp.cluster.connect import dask_settings
 from drakegrasp.errors import ConfigError, MachineError
@@ -73,7 +73,7 @@ def typed(option: Argument, text: str, folder: Path) -> str:
         trimesh.creation.box([0.06, 0.06, 0.06]).export(path / "1_box_a.obj")
     elif not option.parameter.converter:  # no path
         return f"queue={text}" if option.name == "--with" else text
-    elif {refuse_missing, refuse_no_file} & {*option.parameter.validator}:
+    elif {validate_existing, validate_existing_file} & {*option.parameter.validator}:
         path.write_text("{}")
     return str(path)
 

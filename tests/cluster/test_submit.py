@@ -28,11 +28,11 @@ from helpers.scripts import PIPELINES, load_script
 
 import drakegrasp
 from drakegrasp import registry
-from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.choice import cluster_of
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, made_or_given, make_certificates
 from drakegrasp.cluster.jobqueue import Jobs
 from drakegrasp.cluster.kinds import Local
+from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
@@ -312,7 +312,7 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
             assert scheduler.returncode is None
         with connect(scheduler_file=file, tls_files=files) as client:
             client.wait_for_workers(1, timeout=60)
-            with admitted_workers(client, load_config()):
+            with checked_workers(client, load_config()):
                 assert client.run_on_scheduler(saturation) == 1.0
                 ((address, found),) = client.run(environment).items()
                 assert found == WORKER_ENVIRONMENT

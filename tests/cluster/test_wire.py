@@ -24,11 +24,11 @@ from helpers.tiers import in_second_tier
 
 from drakegrasp import build_dataset
 from drakegrasp.cluster import wire
-from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.apart import ProcessApart
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.cluster.wire import by_wire
+from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
@@ -292,7 +292,7 @@ def test_client_that_stopped_goes_on_and_a_killed_worker_changes_nothing(
         hand = read_manifest(out).config
         with (
             pytest.raises(MachineError, match=r"must have hand \w+ like the client, got none"),
-            admitted_workers(client, hand),
+            checked_workers(client, hand),
         ):
             raise AssertionError
     assert_same_files(here, out)
@@ -331,7 +331,7 @@ def test_worker_that_joins_later_must_see_what_the_others_do(
 ) -> None:
     with (
         connect(workers=1) as client,
-        admitted_workers(client, load_config(), tmp_path) as travels,
+        checked_workers(client, load_config(), tmp_path) as travels,
     ):
         assert not travels
         (probe,) = tmp_path.iterdir()

@@ -33,7 +33,7 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.grasp import unpack_grasp
-from drakegrasp.runtime.files import refuse_broken_seal, seal
+from drakegrasp.runtime.files import seal, validate_seal
 
 FILES = (OTO, OTM, TRIALS)
 
@@ -44,9 +44,9 @@ def test_each_seal_is_verified_once(out: Path, monkeypatch: pytest.MonkeyPatch) 
 
     def count(path: Path, what: str = "shard") -> None:
         verified[path] += 1
-        refuse_broken_seal(path, what)
+        validate_seal(path, what)
 
-    monkeypatch.setattr(shards, "refuse_broken_seal", count)
+    monkeypatch.setattr(shards, "validate_seal", count)
     assert assemble(out).removed == {Removal.KEPT: 9}
     assert verified == Counter(out.glob("shards/*/*.h5"))
     assert len(verified) == 6
@@ -188,14 +188,14 @@ def removed(sound: Path) -> Callable[..., Counter[Removal]]:
     return count
 
 
-def test_each_part_of_the_suspicion_reaches_its_filter(
+def test_each_part_of_the_anomaly_reaches_its_filter(
     removed: Callable[..., Counter[Removal]],
 ) -> None:
     """The score of a made-up grasp is 1.2, its depth 0.1 mm, its forces do not carry the weight."""
-    limits = ("max_suspicion", "max_penetration", "max_imbalance", "max_normal_sum")
+    limits = ("max_anomaly", "max_penetration", "max_imbalance", "max_normal_sum")
     for low in (None, *limits):
         overrides = [f"filters.{name}={'1e-5' if name == low else '1e9'}" for name in limits]
-        reason = Removal.KEPT if low is None else Removal.SUSPICIOUS
+        reason = Removal.KEPT if low is None else Removal.ANOMALOUS
         assert removed(*overrides) == {reason: 9}
 
 

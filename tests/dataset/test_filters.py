@@ -98,7 +98,7 @@ def test_outliers_are_judged_among_the_grasps_that_are_left() -> None:
 def test_numbers_of_removals_are_those_in_files() -> None:
     """Files of earlier builds have them: a new one comes at the end."""
     names = "kept other_links slid turned not_seen out_of_view bisects_table flat_depth "
-    names += "off_surface normal_off outlier rejected suspicious missing_finger - own near_cone"
+    names += "off_surface normal_off outlier rejected anomalous missing_finger - own near_cone"
     known = [(value, name) for value, name in enumerate(names.split()) if name != "-"]
     assert [(r.value, r.label) for r in Removal] == known
 
@@ -106,18 +106,18 @@ def test_numbers_of_removals_are_those_in_files() -> None:
 @pytest.mark.parametrize(
     ("field", "limit"),
     [
-        ("suspicion", "max_suspicion"),
+        ("anomaly", "max_anomaly"),
         ("penetration", "max_penetration"),
         ("imbalance", "max_imbalance"),
         ("normal_sum", "max_normal_sum"),
     ],
 )
-def test_limits_of_suspicion_are_off_until_they_are_set(field: str, limit: str) -> None:
+def test_limits_of_anomaly_are_off_until_they_are_set(field: str, limit: str) -> None:
     values = np.array([0.1, 0.3, np.nan])
     successes = good(3).with_columns(**{field: values})
     assert np.all(judge(successes, FilterConfig()) == Removal.KEPT)
     removal = judge(successes, FilterConfig(**{limit: 0.2}))
-    assert removal.tolist() == [Removal.KEPT, Removal.SUSPICIOUS, Removal.SUSPICIOUS]
+    assert removal.tolist() == [Removal.KEPT, Removal.ANOMALOUS, Removal.ANOMALOUS]
 
 
 def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:

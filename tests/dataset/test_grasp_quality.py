@@ -1,4 +1,4 @@
-"""Suspicion is of its own columns."""
+"""Anomaly is of its own columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drakegrasp.dataset.quality import (
     CAP,
     COLUMNS,
     PARTS,
-    suspicion,
+    anomaly,
 )
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import ROBUST_FIELDS
@@ -30,7 +30,7 @@ SCALES = {part.name: part.scale for part in PARTS}
 
 
 def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
-    """Columns of grasps of which no part is suspicious; the lifted object is turned."""
+    """Columns of grasps of which no part is anomalous; the lifted object is turned."""
     R_TO = rotation_about([0.0, 0.0, 1.0], 0.3) @ rotation_about([1.0, 0.0, 0.0], 2.0)
     pull_T = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [0.0, 0.0, mass * module.GRAVITY]])
     rows: dict[str, Any] = {
@@ -69,8 +69,8 @@ def test_scales_are_those_of_the_docs() -> None:
     }
 
 
-def test_a_firm_grasp_is_not_suspicious() -> None:
-    found = suspicion(firm())
+def test_a_firm_grasp_is_not_anomalous() -> None:
+    found = anomaly(firm())
     assert set(COLUMNS) == set(firm())
     np.testing.assert_allclose(found.score, 0.0, atol=1e-12)
     assert list(found.values) == list(found.shares) or set(found.values) == set(found.shares)
@@ -83,7 +83,7 @@ def test_a_fingertip_that_does_not_touch_has_no_contact_to_doubt() -> None:
     for name in ("normal_angle", "surface_distance"):
         columns[name][:, 2] = np.nan
     columns["closed_nhat_Q_O"][:] = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [np.nan] * 3]
-    np.testing.assert_allclose(suspicion(columns).score, 0.0, atol=1e-12)
+    np.testing.assert_allclose(anomaly(columns).score, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_fingertip_that_does_not_touch_has_no_contact_to_doubt() -> None:
 def test_each_part_is_of_its_own_column(part: str, column: str, value: Any) -> None:
     columns = firm()
     columns[column][1] = value
-    found = suspicion(columns)
+    found = anomaly(columns)
     expected = 1.0 / 3.0 if part == "normal_sum" else np.max(value)
     assert found.values[part][1] == pytest.approx(expected)
     assert found.score[1] == pytest.approx(expected / SCALES[part])
@@ -117,7 +117,7 @@ def test_forces_must_carry_the_weight_upwards() -> None:
     columns["lifted_f_Q_O"][1] = 0.0
     R_TO = columns["X_TO_lifted"][2].reshape(3, 4)[:, :3]
     columns["lifted_f_Q_O"][2, 0] += R_TO.T @ [0.0, 1.0, 0.0]
-    found = suspicion(columns).values["imbalance"]
+    found = anomaly(columns).values["imbalance"]
     np.testing.assert_allclose(found, [0.0, 1.0, 1.0 / 19.62], atol=1e-12)
 
 
@@ -125,7 +125,7 @@ def test_parts_add_up_in_squares_and_are_capped() -> None:
     columns = firm(2)
     columns["slip"][:] = [0.010, 1.0]
     columns["lifted_other_links"][:] = [2, 0]
-    np.testing.assert_allclose(suspicion(columns).score, [np.sqrt(5.0), CAP])
+    np.testing.assert_allclose(anomaly(columns).score, [np.sqrt(5.0), CAP])
 
 
 def test_an_attempt_is_judged_by_the_stages_that_it_reached() -> None:
@@ -134,18 +134,18 @@ def test_an_attempt_is_judged_by_the_stages_that_it_reached() -> None:
     columns["time_close"][0] = columns["time_lift"][0] = columns["time_lift"][1] = np.nan
     columns["closed_penetration"][:] = 1e-3
     columns["closed_nhat_Q_O"][1, 2] = np.nan  # the finger that does not touch
-    found = suspicion(columns)
+    found = anomaly(columns)
     assert np.isnan(found.score).tolist() == [True, False, False]
     assert np.isnan(found.values["slip"]).tolist() == [True, True, False]
     assert found.values["penetration"][1] == 1e-3
     assert found.values["normal_sum"][1] == pytest.approx(1.0 / 3.0)
 
 
-def test_a_success_without_a_normal_is_most_suspicious_by_it() -> None:
+def test_a_success_without_a_normal_is_most_anomalous_by_it() -> None:
     columns = firm(2)
     columns["closed_nhat_Q_O"][1, 0] = np.nan
     columns["normal_angle"][1, 0] = np.nan
-    found = suspicion(columns)
+    found = anomaly(columns)
     assert found.shares["normal_sum"][1] == found.shares["normal_angle"][1] == CAP
     assert found.score[1] == pytest.approx(np.sqrt(2.0) * CAP)
 
@@ -155,7 +155,7 @@ def test_normals_are_of_the_fingers_that_a_preshape_uses() -> None:
     columns["closed_nhat_Q_O"][:] = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [np.nan] * 3]
     columns["closed_touching"][:, 2] = False
     columns["unused"][1] = 0b100
-    np.testing.assert_allclose(suspicion(columns).values["normal_sum"], [2.0 / 3.0, 1.0])
+    np.testing.assert_allclose(anomaly(columns).values["normal_sum"], [2.0 / 3.0, 1.0])
 
 
 @pytest.mark.parametrize("fingers", [2, 3, 4])
@@ -167,7 +167,7 @@ def test_sum_of_normals_is_per_finger_of_the_hand(fingers: int) -> None:
         else values
         for name, values in firm().items()
     }
-    assert suspicion(columns).values["normal_sum"] == pytest.approx(1.0)
+    assert anomaly(columns).values["normal_sum"] == pytest.approx(1.0)
 
 
 def test_files_of_builds_with_repeats_alone_have_the_columns(out: Path, tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(
     assert not touching.all()
     assert replay_trial(report.out, row).same
 
-    # What is not there makes it no more suspicious.
+    # What is not there makes it no more anomalous.
     snapshot = read_snapshot(report.out)
     for part in ("normal_angle", "surface_distance", "normal_sum"):
         assert np.isfinite(snapshot.table[part][row])

@@ -14,7 +14,7 @@ from drakegrasp.dataset.hdf5 import read_columns
 from drakegrasp.dataset.schema import LOOK_FIELDS, Field, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, trial_columns
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.files import refuse_broken_seal
+from drakegrasp.runtime.files import validate_seal
 
 SIZES = sizes(fingers=3, joints=8, image=8)
 
@@ -55,7 +55,7 @@ def some_shard(*, trials: int = 12, looks: int = 3, seed: int = 0) -> Shard:
 def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
     """Return a shard; without a header, that of any work unit."""
     if header is None:
-        refuse_broken_seal(path)
+        validate_seal(path)
         with h5py.File(path) as file:
             header = ShardHeader(**{name: file.attrs[name] for name in HEADER.stored})
     with open_shard(path, header) as file:

@@ -36,7 +36,7 @@ def good(count: int) -> Table:
         depth_variance=np.full(count, 0.01),
         surface_distance=np.full(count, 1e-4),
         normal_angle=np.full(count, np.deg2rad(29.0)),
-        suspicion=np.full(count, 1.0),
+        anomaly=np.full(count, 1.0),
         penetration=np.full(count, 1e-3),
         imbalance=np.full(count, 0.01),
         normal_sum=np.full(count, 0.3),

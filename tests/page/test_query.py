@@ -54,9 +54,9 @@ def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
 
 
 def test_order_is_by_the_quantity_and_those_without_come_last(snapshot: Snapshot) -> None:
-    score = snapshot.table.suspicion.copy()
+    score = snapshot.table.anomaly.copy()
     score[[0, 3, 11]] = [5.0, np.nan, 7.0]
-    changed = replace(snapshot, table=snapshot.table.with_columns(suspicion=score))
+    changed = replace(snapshot, table=snapshot.table.with_columns(anomaly=score))
     down, up = chosen(changed, ""), chosen(changed, "order=up")
     assert down[:2] == ["0-3-2", "0-0-0"]
     assert up[-3:] == ["0-0-0", "0-3-2", "0-1-0"]

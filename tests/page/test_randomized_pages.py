@@ -37,7 +37,7 @@ def imbalance(out: Path) -> np.ndarray:
     return np.linalg.norm(rest_T, axis=1) / weights
 
 
-def test_suspicion_is_of_the_drawn_mass(drawn: Path) -> None:
+def test_anomaly_is_of_the_drawn_mass(drawn: Path) -> None:
     snapshot, expected = read_snapshot(drawn), imbalance(drawn)
     for i in (0, 3, 11):
         assert snapshot.table.imbalance[i] == pytest.approx(expected[i], rel=1e-6)

@@ -16,7 +16,7 @@ from helpers.objects import from_above, standing
 from drakegrasp.frames import X_WT
 from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.contacts import Way
+from drakegrasp.simulation.contacts import ClearanceMonitor
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.trial import run_attempt
 
@@ -67,12 +67,12 @@ def test_clearance_is_the_least_of_all_steps(scene, cube, config, standoff) -> N
 def test_lift_begins_where_closing_ended(scene, cube, config, monkeypatch) -> None:
     looks = list[float]()
 
-    class Noted(Way):
+    class Noted(ClearanceMonitor):
         def look(self, scene: Scene) -> None:
             looks.append(scene.time)
             super().look(scene)
 
-    monkeypatch.setattr("drakegrasp.simulation.lift.Way", Noted)
+    monkeypatch.setattr("drakegrasp.simulation.lift.ClearanceMonitor", Noted)
     rules = override_config(config, ["lift.drive=torque"])
     noted = record_heights(scene)
     try:

@@ -23,7 +23,7 @@ from drakegrasp.frames import make_pose, pack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.verification.result_files import json_line, refuse_unwritable, write_results
+from drakegrasp.verification.result_files import json_line, validate_writable, write_results
 
 CONFIG = load_config()
 RNG = np.random.default_rng(0)
@@ -173,8 +173,8 @@ def test_place_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.h5").mkdir()
     with pytest.raises(DataError, match="must be in a folder that can be written"):
-        refuse_unwritable(tmp_path / "file" / "deep" / "run.h5")
+        validate_writable(tmp_path / "file" / "deep" / "run.h5")
     with pytest.raises(DataError, match=r"folder\.h5: must be a file, got a folder"):
-        refuse_unwritable(tmp_path / "folder.h5")
-    refuse_unwritable(tmp_path / "new" / "deep" / "run.h5")
+        validate_writable(tmp_path / "folder.h5")
+    validate_writable(tmp_path / "new" / "deep" / "run.h5")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.h5"]

@@ -39,8 +39,8 @@ from drakegrasp.hand.parsing import (
     joint_axis,
     joint_slides,
     moving_joint,
-    refuse_impossible,
-    refuse_other_joint,
+    validate_joint,
+    validate_joints,
 )
 from drakegrasp.mesh.wavefront import obj_text
 
@@ -72,7 +72,7 @@ def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
             collision shape cannot be read.
     """
     text, root = _text_of(path)
-    refuse_impossible(root)
+    validate_joints(root)
     masses, impossible = declared_masses(root), impossible_inertias(root)
     for name, mass in masses.items():
         if mass < 0.0:
@@ -189,7 +189,7 @@ def _parse(plant: MultibodyPlant, path: Path) -> ModelInstanceIndex:
 
 def _joint(joint: Any, effort: float) -> VendorJoint:
     """Return what a joint of Drake is."""
-    refuse_other_joint(joint)
+    validate_joint(joint)
     X_PJ, X_CJ = (
         np.asarray(frame.GetFixedPoseInBodyFrame().GetAsMatrix4())
         for frame in (joint.frame_on_parent(), joint.frame_on_child())

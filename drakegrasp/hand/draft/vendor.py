@@ -24,7 +24,7 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, rotation_about, transform_points
 from drakegrasp.hand.draft.shapes import Shape, added, solid_inertia
-from drakegrasp.hand.parsing import Mimic, refuse_limits
+from drakegrasp.hand.parsing import Mimic, validate_limits
 from drakegrasp.mesh.wavefront import obj_text
 
 #: Limits of a joint that has none.
@@ -215,7 +215,7 @@ def weld(model: VendorModel) -> VendorModel:
     for head, link in links.items():
         if head in carriers:
             joint = carriers[head]
-            refuse_limits(joint.name, *joint.limits)
+            validate_limits(joint.name, *joint.limits)
             above, X_LP = places[joint.parent]
             joints[joint.name] = replace(
                 joint,
@@ -227,7 +227,7 @@ def weld(model: VendorModel) -> VendorModel:
     mimics = _leaders(model.mimics, joints)
     named = {link.name: link for link in links.values()}
     welded = replace(model, links=named, joints=joints, mimics=mimics, notes=tuple(notes))
-    _refuse_size(welded)
+    _validate_size(welded)
     return welded
 
 
@@ -353,7 +353,7 @@ def _leaders(given: Mapping[str, Mimic], joints: Mapping[str, VendorJoint]) -> d
     return found
 
 
-def _refuse_size(model: VendorModel) -> None:
+def _validate_size(model: VendorModel) -> None:
     """Reject a model without shapes, or a model whose units are not metres."""
     points = [transform_points(model.pose(n, {}), own.corners()) for n, own in model.links.items()]
     cloud = np.concatenate(points)

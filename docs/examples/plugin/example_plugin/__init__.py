@@ -12,7 +12,7 @@ import numpy as np
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.kinds import Local
 from drakegrasp.exchange.export import read_closed_grasps
-from drakegrasp.filters import Removal, Rule
+from drakegrasp.filters import Filter, Removal
 from drakegrasp.frames import invert_pose, make_pose
 from drakegrasp.protocols.protocol import DexGraspBench
 
@@ -22,7 +22,7 @@ HAND = Path(__file__).with_name("jaw_hand.yaml")
 HELP = "a line of JSON per sample: object, palm pose, joints"
 
 #: A rule decides which rows of a table are removed: here objects that turned in the hand.
-CALM = Rule(
+CALM = Filter(
     removal=Removal.OWN,
     needs=("turn",),
     refuses=lambda table, limits: ~(table["turn"] <= np.radians(3.0)),

@@ -94,7 +94,7 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
 
 
 @contextmanager
-def admitted_workers(
+def checked_workers(
     client: Client, config: Config, out: Path | None = None, meshes: Sequence[Path] = ()
 ) -> Iterator[bool]:
     """Reject unsuitable workers, and check workers that join while the block runs.

@@ -8,8 +8,8 @@ import socket
 import pytest
 from distributed import Worker
 
-from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.errors import MachineError
 from drakegrasp.hand.settings import load_config
 
@@ -41,14 +41,14 @@ def test_machine_without_opengl_is_left_out_and_one_must_be_left(
 ) -> None:
     with connect(workers=2) as client:
         client.run(_become_a_machine)
-        with admitted_workers(client, load_config()):
+        with checked_workers(client, load_config()):
             assert list(client.run(_name).values()) == ["0"]
 
         # A build with none does not begin.
         client.run(_lose_the_driver)
         with (
             pytest.raises(MachineError, match=r"a test image, got .*`drakegrasp doctor`"),
-            admitted_workers(client, load_config()),
+            checked_workers(client, load_config()),
         ):
             raise AssertionError
     assert "not used: workers on machine1: must render a test image" in capfd.readouterr().err
