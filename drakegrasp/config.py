@@ -46,13 +46,13 @@ LARGEST, SMALLEST = 1e12, 1e-12
 MOST, MOST_SEED = 2**31 - 1, 2**64 - 1
 
 
-def _validate_lengths(value: float) -> float:
+def _validate_not_tiny(value: float) -> float:
     if value < SMALLEST:
         raise ValueError(f"must be at least {SMALLEST:g}, got {value}")
     return value
 
 
-def _validate_metres(value: float) -> float:
+def _validate_at_most_1_m(value: float) -> float:
     if value > 1.0:
         raise ValueError(f"must be at most 1 m, got {value:g} m")
     return value
@@ -60,7 +60,7 @@ def _validate_metres(value: float) -> float:
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[
-    float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False), AfterValidator(_validate_lengths)
+    float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False), AfterValidator(_validate_not_tiny)
 ]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1, le=MOST)]
@@ -69,7 +69,7 @@ Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 #: Distances of the palm from the object [m].
 Standoffs = Annotated[
-    tuple[Annotated[Positive, AfterValidator(_validate_metres)], ...], Field(min_length=1)
+    tuple[Annotated[Positive, AfterValidator(_validate_at_most_1_m)], ...], Field(min_length=1)
 ]
 Angles = Annotated[tuple[Number, ...], Field(min_length=1)]
 #: Identifier of a licence: a line of printable ASCII.

@@ -31,7 +31,7 @@ from tornado.ioloop import IOLoop
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.foreign_files import read_json
 from drakegrasp.generation.prepare import PREPARE_SECONDS
-from drakegrasp.runtime.executor import count_workers, validate_main_module
+from drakegrasp.runtime.executor import count_workers, validate_can_start_processes
 from drakegrasp.runtime.journal import wall_limit
 
 #: Address that only this machine can reach.
@@ -325,7 +325,7 @@ def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
 
 @contextmanager
 def _start_local(workers: int, security: Security | None, memory: str) -> Iterator[Client]:
-    validate_main_module()
+    validate_can_start_processes()
     with _undisturbed_loop() as loop:
         try:
             cluster = PrivateCluster(workers, loop=loop, security=security, memory=memory)

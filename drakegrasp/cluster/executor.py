@@ -117,7 +117,7 @@ class DaskExecutor:
             try:
                 result: R = self._gather(cast(Future, task.future))
             except (KilledWorker, BlankImageError) as error:
-                self._validate_retry(task, error)
+                self._count_failure(task, error)
                 self._submit(function, task, pending, done)
             else:
                 yield result
@@ -158,7 +158,7 @@ class DaskExecutor:
                 self._count_workers()
         raise _scheduler_lost("its tasks are cancelled")
 
-    def _validate_retry(self, task: _PendingTask[Any], error: Exception) -> None:
+    def _count_failure(self, task: _PendingTask[Any], error: Exception) -> None:
         """Check that a failed task may be submitted again.
 
         Raises:

@@ -51,7 +51,7 @@ from drakegrasp.dataset.paths import (
     recorded_model,
     validate_model_file,
 )
-from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, validate_schema
+from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, validate_schema_version
 from drakegrasp.dataset.shards import ShardHeader, open_shard
 from drakegrasp.dataset.survey import headers_by_object, known_homes, shards_sha256
 from drakegrasp.dataset.trials import Stamp, Trials, reopened, stamp
@@ -255,7 +255,7 @@ def _header(path: Path) -> _Look:
     """Check the attributes and the layout of a file; no row is read."""
     kinds, tables = FILES[path.name]
     with open_hdf5(path) as file:
-        validate_schema(path, file.attrs.get("schema_version"))
+        validate_schema_version(path, file.attrs.get("schema_version"))
         mistakes, layout = list(attribute_mistakes(file, kinds)), list(differences(file, tables))
         # A group with an invalid column is not read; without sound attributes, nothing is.
         broken = {*tables} if mistakes else {each.path[1:].split("/")[0] for each in layout}

@@ -36,7 +36,7 @@ from drakegrasp.dataset.schema import (
     VIEW_FIELDS,
     VISIBLE_FIELDS,
     Field,
-    validate_schema,
+    validate_schema_version,
 )
 from drakegrasp.errors import DataError, first_line, printable
 from drakegrasp.foreign_files import parse_json, validate_regular
@@ -262,9 +262,9 @@ def _opened_whole(path: Path, what: str, kinds: Kinds, tables: Tables) -> Iterat
         # has none.
         if "schema_version" not in file.attrs:
             raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
-        validate_schema(path, file.attrs["schema_version"])
-        validate_file(path, attribute_mistakes(file, kinds))
-        validate_file(path, differences(file, tables))
+        validate_schema_version(path, file.attrs["schema_version"])
+        raise_first_mistake(path, attribute_mistakes(file, kinds))
+        raise_first_mistake(path, differences(file, tables))
         yield file
 
 
@@ -281,7 +281,7 @@ open_samples, open_trials, open_scenes = (
 )
 
 
-def validate_file(path: Path, mistakes: Iterable[object]) -> None:
+def raise_first_mistake(path: Path, mistakes: Iterable[object]) -> None:
     """Reject a file that has any mistake; the error reports the first one.
 
     Raises:

@@ -39,7 +39,7 @@ from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import (
     CONVENTIONS,
     SCHEMA_VERSION,
-    validate_schema,
+    validate_schema_version,
 )
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.split import Home
@@ -315,7 +315,7 @@ def read_manifest(out: Path) -> Manifest:
         ) from None
 
     # Check the version first: another schema may have other keys.
-    validate_schema(path, tree.get("schema_version"))
+    validate_schema_version(path, tree.get("schema_version"))
     stored = validated(path, content, _Stored)
     try:
         config = parse_stored(stored.config)
@@ -377,7 +377,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
 
     # Without a manifest, it may only contain what an interrupted build leaves.
     if not (out / FILE_NAME).exists():
-        _validate_files(out)
+        _validate_no_other_files(out)
         return None
 
     # With a manifest, the build must continue the same dataset.
@@ -398,7 +398,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     return manifest
 
 
-def _validate_files(out: Path) -> None:
+def _validate_no_other_files(out: Path) -> None:
     """Raise an error if a directory has files that none of our builds writes.
 
     Raises:

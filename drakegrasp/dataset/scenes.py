@@ -150,11 +150,11 @@ class SceneDataset:
         seed: int = 0,
         cache: int = 512 << 20,
     ) -> None:
-        _validate_same("frame", frame, FRAMES)
-        _validate_same("negatives", negatives, get_args(Negatives))
-        _validate_same("balance", balance, get_args(Balance))
-        _validate_same("positives", positives, get_args(Positives))
-        _validate_same("split", split, SPLITS)
+        _validate_choice("frame", frame, FRAMES)
+        _validate_choice("negatives", negatives, get_args(Negatives))
+        _validate_choice("balance", balance, get_args(Balance))
+        _validate_choice("positives", positives, get_args(Positives))
+        _validate_choice("split", split, SPLITS)
         for name, count in (("points", points), ("grasps", grasps)):
             if count is not None and count < 1:
                 raise DataError(f"{name} must be 1 or more, got {count}")
@@ -243,7 +243,7 @@ class SceneDataset:
 
     def grasps_in(self, view: int, *, frame: str = Frame.TABLE) -> dict[str, AnyArray]:
         """Return all g grasps of a view's scene, by the keys of an item."""
-        _validate_same("frame", frame, FRAMES)
+        _validate_choice("frame", frame, FRAMES)
         X_AT = invert_pose(self._X_TC[view]) if frame == "camera" else np.eye(4)
         return self._grasps_of(view, self.rows_in(self._scene_of[view]), X_AT)
 
@@ -513,7 +513,7 @@ _AS_STORED = (
 )
 
 
-def _validate_same(name: str, value: object, known: tuple[str, ...]) -> None:
+def _validate_choice(name: str, value: object, known: tuple[str, ...]) -> None:
     if value not in known:
         raise DataError(f"{name} must be one of {', '.join(known)}, got {value!r}")
 

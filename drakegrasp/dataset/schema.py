@@ -180,7 +180,7 @@ def is_readable(version: object) -> bool:
     return whole and version == SCHEMA_VERSION
 
 
-def validate_schema(path: Path, version: object) -> None:
+def validate_schema_version(path: Path, version: object) -> None:
     """Raise an error if a file has another version of the schema.
 
     Args:

@@ -21,7 +21,7 @@ from drakegrasp.dataset.schema import (
     SCHEMA_VERSION,
     TRIAL_FIELDS,
     Field,
-    validate_schema,
+    validate_schema_version,
 )
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import atomic_hdf5, validate_seal
@@ -129,7 +129,7 @@ def open_shard(path: Path, header: ShardHeader, *, verify_seal: bool = True) -> 
     if verify_seal:
         validate_seal(path)
     with opened(path, "a complete shard", again=not verify_seal) as file:
-        validate_schema(path, file.attrs.get("schema_version"))
+        validate_schema_version(path, file.attrs.get("schema_version"))
 
         # Check the identity: a file may have been copied to the path of another unit.
         own = ShardHeader(**{name: file.attrs[name] for name in header.stored})

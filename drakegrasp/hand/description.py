@@ -276,7 +276,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
     limits = np.array(
         [(j.position_lower_limit(), j.position_upper_limit()) for j in moving.values()]
     ).reshape(-1, 2)
-    _validate_kinds(described, moving)
+    _validate_joint_kinds(described, moving)
     for joint, (lower, upper) in zip(moving, limits, strict=True):
         position = described.preshape.get(joint, lower)
         if not lower <= position <= upper:
@@ -337,7 +337,7 @@ def _pose(rpy_deg: Sequence[float], p: Sequence[float]) -> Array:
     return make_pose(RollPitchYaw(np.deg2rad(rpy_deg)).ToRotationMatrix().matrix(), p)
 
 
-def _validate_kinds(described: HandFile, joints: dict[str, Any]) -> None:
+def _validate_joint_kinds(described: HandFile, joints: dict[str, Any]) -> None:
     """Reject a closing joint that slides without a force limit or turns without a torque limit."""
     for i, finger in enumerate(described.driven_fingers()):
         slides = joint_slides(joints[finger.closing_joint])

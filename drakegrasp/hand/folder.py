@@ -306,7 +306,7 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
     content = hand_folder(config.hand_source)
     carried = CarriedHand(path=path, digest=content.digest)
     if known is None and not isinstance(config.hand_source, CarriedHand):
-        _validate_files(content, path)
+        _validate_no_other_files(content, path)
     if not _is_there(carried):
         with disk_full_named(out):
             _write(content, path)
@@ -326,7 +326,7 @@ def _is_there(carried: CarriedHand) -> bool:
         return False
 
 
-def _validate_files(content: HandFolder, path: Path) -> None:
+def _validate_no_other_files(content: HandFolder, path: Path) -> None:
     """Reject a folder that contains user files, because a build replaces and removes its content.
 
     Args:

@@ -40,7 +40,7 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
     winding_numbers,
 )
-from drakegrasp.mesh.union import unite, validate_overlap
+from drakegrasp.mesh.union import check_self_intersection, unite
 
 #: Vertices closer than this fraction of the diagonal are merged: above the rounding of files
 #: with eight digits, far below the detail of any scan.
@@ -171,7 +171,7 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
 
     # Unite the components, and check the result.
     vertices, faces = unite(closed, size, notes)
-    validate_overlap(vertices, faces, notes)
+    check_self_intersection(vertices, faces, notes)
     if not len(faces) or not is_solid_surface(faces) or signed_volume(vertices, faces) <= 0.0:
         raise MeshError("the repaired surface must be watertight with outward normals, got gaps")
     _drop_fragments(fragments, vertices, faces, total, notes)

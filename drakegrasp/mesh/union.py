@@ -121,7 +121,7 @@ def _tidy(solid: manifold3d.Manifold, size: float) -> tuple[Array, Faces]:
     return from_manifold(solid)
 
 
-def validate_overlap(vertices: Array, faces: Faces, notes: list[str]) -> None:
+def check_self_intersection(vertices: Array, faces: Faces, notes: list[str]) -> None:
     """Reject a surface that passes through itself; a little of it is noted.
 
     Args:

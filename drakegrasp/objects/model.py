@@ -243,7 +243,7 @@ def make_object(
     # One watertight solid, with no more faces than there is memory to repair.
     vertices, faces, reduced = coarsen(vertices, faces)
     solid = repair_solid(vertices, faces)
-    _validate_thickness(solid)
+    _validate_solid(solid)
     notes = (*reduced, *solid.notes)
     parts = count_parts(solid.vertices, solid.faces)
     if parts > 1:
@@ -282,7 +282,7 @@ def object_of(
     )
 
 
-def _validate_thickness(solid: Solid) -> None:
+def _validate_solid(solid: Solid) -> None:
     """Raise an error for sheets, specks, and a volume that contradicts the convex hull."""
     extents = np.ptp(solid.vertices, axis=0)
     if extents.min() < MIN_EXTENT:

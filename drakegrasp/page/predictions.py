@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from drakegrasp.arithmetic import multiply, norm
-from drakegrasp.dataset.hdf5 import differences, opened, read_codes, validate_file
+from drakegrasp.dataset.hdf5 import differences, opened, raise_first_mistake, read_codes
 from drakegrasp.dataset.reader import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.schema import (
     CAMERAS,
@@ -23,7 +23,7 @@ from drakegrasp.dataset.schema import (
     VERIFICATION_FIELDS,
     Field,
     Shown,
-    validate_schema,
+    validate_schema_version,
 )
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
@@ -104,8 +104,8 @@ class Predictions(Gallery):
             group = file.get(GROUP)
             if not isinstance(group, h5py.Group) or not all(name in group for name in NEEDED):
                 raise DataError(f"{path}: must be a result file of drakegrasp verify, got another")
-            validate_schema(path, file.attrs.get("schema_version"))
-            validate_file(path, differences(file, {GROUP: _MAY_LACK}))
+            validate_schema_version(path, file.attrs.get("schema_version"))
+            raise_first_mistake(path, differences(file, {GROUP: _MAY_LACK}))
             names = group["object"].asstr()[:].tolist()
             self.rows = _matched(path, file, snapshot, names)
             outcome = read_codes(group["outcome"], list(Outcome))

@@ -124,7 +124,7 @@ def count_workers(workers: int | None, name: str = "workers") -> int:
     return available_cores() if workers is None else workers
 
 
-def validate_main_module() -> None:
+def validate_can_start_processes() -> None:
     """Raise an error if processes cannot be started here.
 
     Raises:
@@ -201,7 +201,7 @@ class _PoolExecutor:
             while True:
                 for item in islice(remaining, self.in_flight - len(pending)):
                     # The first submission starts the processes.
-                    validate_main_module()
+                    validate_can_start_processes()
                     with _interrupts_blocked():
                         pending.add(self.pool.submit(function, item))
                 if not pending:

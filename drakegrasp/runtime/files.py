@@ -135,7 +135,7 @@ def new_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
                 yield file
         finally:
             # Other errors would follow from this one.
-            patient.validate_success()
+            patient.raise_failure()
     if sealed:
         seal(path)
 
@@ -178,7 +178,7 @@ class _PatientFile(FileIO):
             self._failure = error
             return size or 0
 
-    def validate_success(self) -> None:
+    def raise_failure(self) -> None:
         """Raise the error of the first write that failed."""
         if self._failure is not None:
             raise self._failure

@@ -90,7 +90,7 @@ def place_on_rows(
         how: dict[str, Any] = {"drawn": drawn, "overrides": overrides, "frame": frame}
         return contacts_on_rows(table, dataset, rows, config=config, **how)
     assert isinstance(table, Attempts)
-    _validate_frame(table)
+    _validate_no_mesh_frame(table)
     chosen = choose_rows(dataset, table.of_row if rows is None else rows, len(table))
     found = []
     for i, placed, used in objects_of_rows(dataset, chosen, config, drawn, overrides):
@@ -122,7 +122,7 @@ def place_on_dataset(
         GraspError: If the postures are in the frames of mesh files.
         DataError: If the dataset cannot be used.
     """
-    _validate_frame(table)
+    _validate_no_mesh_frame(table)
     manifest = read_manifest(out)
     names = [entry.name for entry in manifest.objects]
     table, found = table.refuse(unknown_objects(table, names)), list[PlacedGrasp]()
@@ -140,7 +140,7 @@ def place_on_dataset(
     return found
 
 
-def _validate_frame(table: Attempts) -> None:
+def _validate_no_mesh_frame(table: Attempts) -> None:
     """Reject postures in frames of meshes: a file cannot say which of both meshes it means.
 
     Meshes of a dataset are exported in {O}.

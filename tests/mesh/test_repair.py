@@ -263,7 +263,7 @@ def test_what_passes_through_itself_is_kept_noted_or_refused(share, said, monkey
     surface = np.asarray(box.vertices), np.asarray(box.faces)
     if said == "refused":
         with pytest.raises(MeshError, match=r"must not pass through itself, got 5\.5%"):
-            drakegrasp.mesh.union.validate_overlap(*surface, notes)
+            drakegrasp.mesh.union.check_self_intersection(*surface, notes)
         return
-    drakegrasp.mesh.union.validate_overlap(*surface, notes)
+    drakegrasp.mesh.union.check_self_intersection(*surface, notes)
     assert any("passes through" in note for note in notes) is (said == "noted")
