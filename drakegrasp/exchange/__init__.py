@@ -1,1 +1,1 @@
-"""Exchange: a dataset in the formats of other tools."""
+"""Exchange: files of other tools become postures; a dataset is written in their formats."""

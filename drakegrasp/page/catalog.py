@@ -27,9 +27,8 @@ from drakegrasp.hand.folder import carried_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.table import AnyArray, Table, join
 
-#: Quantities for sorting, besides the parts of the anomaly.
-EXTRA = ("anomaly",)
-FEATURES = (*EXTRA, *(part.name for part in PARTS))
+#: Quantities for sorting: the anomaly score, and its parts.
+FEATURES = ("anomaly", *(part.name for part in PARTS))
 #: Columns that identify an attempt.
 IDENTITY = ("object", "candidate", "standoff_index")
 #: Columns that the table of attempts copies, and their types.

@@ -1,1 +1,1 @@
-"""Contact sheets, third-person pictures, recordings."""
+"""Figures of a dataset, its contact sheet, drawn scenes, recordings."""

@@ -42,7 +42,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
+from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
@@ -50,12 +50,13 @@ from drakegrasp.errors import MachineError, MeshError
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.loading import load_surface
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import object_colour
-from drakegrasp.vision.rendering import BLANK, GREY, add_posed_hand
+from drakegrasp.vision.rendering import BLANK, GREY
 
 #: Vertical field of view [deg]: narrow, so that perspective distorts little.
 FOV_Y_DEG = 26.0
@@ -115,7 +116,7 @@ class StillScene:
         # The hand, whose palm can be placed anywhere.
         builder = DiagramBuilder()
         plant, graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
-        instance, self._wrist = add_posed_hand(plant, hand)
+        instance, self._wrist = _add_posed_hand(plant, hand)
         if add is not None:
             add(plant, instance)
         plant.Finalize()
@@ -205,6 +206,29 @@ class StillScene:
         info = CameraInfo(*size, np.deg2rad(FOV_Y_DEG))
         core = RenderCameraCore(lighting.name, info, ClippingRange(0.05, 20.0), RigidTransform())
         return ColorRenderCamera(core, False)
+
+
+def _add_posed_hand(
+    plant: MultibodyPlant, hand: Hand
+) -> tuple[ModelInstanceIndex, FixedOffsetFrame]:
+    """Add a hand whose palm can be placed anywhere without a joint.
+
+    The palm is welded to a frame whose pose is a parameter of the context.
+
+    Args:
+        plant: Not finalized; its shapes are drawn.
+        hand: The hand. Its model may contain links of any name: our names must differ from them.
+
+    Returns:
+        The plant's model of the hand, and that frame in the world.
+    """
+    instance = add_model(plant, hand.model)
+    base = plant.GetBodyByName(hand.palm_link, instance)
+    X_BG = RigidTransform(hand.X_BG)
+    palm = plant.AddFrame(FixedOffsetFrame("drakegrasp_palm", base.body_frame(), X_BG, instance))
+    wrist = plant.AddFrame(FixedOffsetFrame("wrist", plant.world_frame(), RigidTransform()))
+    plant.WeldFrames(wrist, palm)
+    return instance, wrist
 
 
 def camera_pose(p_WA: Array, azimuth: float, elevation: float, *, fill: float = 1.0) -> Array:

@@ -1,1 +1,1 @@
-"""Scores of predicted grasps and of reference rows: cards, and the frozen benchmark."""
+"""Scores of predicted grasps; grasps for what a camera saw, and their order."""

@@ -409,8 +409,8 @@ LONGEST = 60
 #: `jitter_deg` it also decides which word of the stream jitters which angle, so another number
 #: changes the draw.
 CHUNK = 131_072
-#: Bits of one rounded entry (-1e6 to 1e6), and number of entries in one 64-bit integer.
-BITS, PER_WORD = 21, 3
+#: Bits of one rounded entry (-1e6 to 1e6); three entries are in one 64-bit integer.
+BITS = 21
 
 Numbers = npt.NDArray[np.int64]
 #: The angles of three axes [degree].

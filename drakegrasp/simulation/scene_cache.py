@@ -75,10 +75,10 @@ def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand, most: in
     return _diagrams.setdefault(key, build_scene(model, physics, hand))
 
 
-def cached_renderer(model: ObjectModel, config: CameraConfig, hand: Hand | None = None) -> Renderer:
+def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     """Return the renderer of an object; use it only in the thread that first requested it."""
-    key = "renderer", _digest(model.name, model.visual_vertices, model.visual_faces), config, hand
-    return _cached(key, lambda: build_renderer(model, config, hand))
+    key = "renderer", _digest(model.name, model.visual_vertices, model.visual_faces), config
+    return _cached(key, lambda: build_renderer(model, config))
 
 
 def forget_scenes() -> None:

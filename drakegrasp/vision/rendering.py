@@ -1,8 +1,7 @@
 """Rendering: RGB, depth and mask of the resting object from a camera pose.
 
 Input: an object, its resting pose and a camera pose. Output: images of object and table. The
-renderer has its own diagram, without physics. The images of a dataset show no hand; those of a
-trial over time do (`build_renderer` with a hand, `pose_hand`).
+renderer has its own diagram, without physics, and its images show no hand.
 
 A renderer must be built and used in one thread. Drake's first rendering thread owns the OpenGL
 context, and any other thread silently gets a blank image. A blank image is an error here.
@@ -35,8 +34,6 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    ModelInstanceIndex,
     RigidBody,
     SpatialInertia,
 )
@@ -47,9 +44,8 @@ from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, transform_points
-from drakegrasp.hand.description import Hand
 from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.parsing import add_model, make_parser
+from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import prepare_rendering
@@ -108,7 +104,6 @@ class Renderer:
         half_extents: Half extents of the object's box, (3,) [m].
         config: The camera.
         appearance: Colours of object and table, and the light; `paint` changes it.
-        hand: The plant's model of the hand, and the frame that carries its palm, if there is one.
     """
 
     diagram: Diagram
@@ -120,11 +115,10 @@ class Renderer:
     half_extents: Array
     config: CameraConfig
     appearance: Appearance
-    hand: tuple[ModelInstanceIndex, FixedOffsetFrame] | None = None
 
 
-def build_renderer(model: ObjectModel, config: CameraConfig, hand: Hand | None = None) -> Renderer:
-    """Return a renderer of an object's full mesh on the table, and of a hand if there is one."""
+def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
+    """Return a renderer of an object's full mesh on the table."""
     prepare_rendering()
 
     # The object, and the table of the simulation.
@@ -135,7 +129,6 @@ def build_renderer(model: ObjectModel, config: CameraConfig, hand: Hand | None =
     (instance,) = make_parser(plant).AddModels(MODELS / "table.urdf")
     table = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), table.body_frame(), RigidTransform(X_WT))
-    drawn = None if hand is None else add_posed_hand(plant, hand)
     plant.Finalize()
     diagram = builder.Build()
     return Renderer(
@@ -148,40 +141,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig, hand: Hand | None =
         half_extents=model.half_extents,
         config=config,
         appearance=appearance,
-        hand=drawn,
     )
-
-
-def add_posed_hand(
-    plant: MultibodyPlant, hand: Hand
-) -> tuple[ModelInstanceIndex, FixedOffsetFrame]:
-    """Add a hand whose palm can be placed anywhere without a joint.
-
-    The palm is welded to a frame whose pose is a parameter of the context.
-
-    Args:
-        plant: Not finalized; its shapes are drawn.
-        hand: The hand. Its model may contain links of any name: our names must differ from them.
-
-    Returns:
-        The plant's model of the hand, and that frame in the world.
-    """
-    instance = add_model(plant, hand.model)
-    base = plant.GetBodyByName(hand.palm_link, instance)
-    X_BG = RigidTransform(hand.X_BG)
-    palm = plant.AddFrame(FixedOffsetFrame("drakegrasp_palm", base.body_frame(), X_BG, instance))
-    wrist = plant.AddFrame(FixedOffsetFrame("wrist", plant.world_frame(), RigidTransform()))
-    plant.WeldFrames(wrist, palm)
-    return instance, wrist
-
-
-def pose_hand(renderer: Renderer, X_TG: npt.ArrayLike, q: npt.ArrayLike) -> None:
-    """Move the hand of a renderer: its palm to X_TG (4, 4), its joints to q (j,) [rad or m]."""
-    assert renderer.hand is not None
-    instance, wrist = renderer.hand
-    context = renderer.plant.GetMyMutableContextFromRoot(renderer.context)
-    wrist.SetPoseInParentFrame(context, RigidTransform(multiply(X_WT, X_TG)))
-    renderer.plant.SetPositions(context, instance, np.asarray(q, dtype=float))
 
 
 def paint(renderer: Renderer, appearance: Appearance) -> None:

@@ -38,9 +38,8 @@ sizes depend only on its class, its index and `--objects-seed` (`builtin.seed`),
 of objects per class does not change the earlier objects. The same seed produces the same mesh files
 on every machine.
 
-`--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: one object of a class
-is [tested](outcomes.md#split), and the others train. Both options are stored in `manifest.json`,
-and a build can be resumed only with the same values.
+`--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default. Both options are
+stored in `manifest.json`, and a build can be resumed only with the same values.
 
 Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as on a
 table, with z up, and keeps this pose when it is dropped. Hollow objects have walls of 4.5 to 6 mm.
