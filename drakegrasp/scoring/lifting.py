@@ -30,8 +30,7 @@ from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.conditions import usual_conditions
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
-from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.simulation.scene_cache import run_cached
 from drakegrasp.vision.completion import View, complete
 
 #: Shifts of the palm along Gx and Gy [m], and the factor of the friction, of the further lifts.
@@ -123,11 +122,7 @@ def _is_sample(placed: PlacedObject, start: Attempt) -> bool:
     """Return whether a lift of the object from a start in {T} ends as a sample."""
     config = placed.config
     attempt = replace(start, X_OG=multiply(invert_pose(placed.X_TO), start.X_OG))
-    scene = cached_scene(placed.model, config.physics, config.hand_source, start.preshape)
-    trial = run_attempt(scene, placed.X_TO_simulated, attempt, config)
-    # A scene in which Drake failed is never used again.
-    if trial.outcome.inconclusive:
-        forget_scenes()
+    trial = run_cached(placed.model, placed.X_TO_simulated, attempt, config)
     return judge_sample(placed.model, trial, config) is Removal.KEPT
 
 

@@ -23,8 +23,8 @@ from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.placement import PlacedObject, config_for, validate_same_objects
-from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.scene_cache import run_cached
+from drakegrasp.simulation.trial import TrialRecord
 
 #: A joint follows the hand file if it is at most this far from where the file has it (coupled
 #: joint) or from another spread joint, in units of its finger's closing joint.
@@ -249,10 +249,4 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
     hand = load_hand(config.hand_source)
     validate_posture(posture, hand)
     start = start_of(posture, hand)
-    scene = cached_scene(placed.model, config.physics, config.hand_source, start.preshape)
-    trial = run_attempt(scene, placed.X_TO_simulated, start, config)
-
-    # A scene in which Drake failed is never used again.
-    if trial.outcome.inconclusive:
-        forget_scenes()
-    return trial
+    return run_cached(placed.model, placed.X_TO_simulated, start, config)

@@ -20,11 +20,14 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.multibody.plant import MultibodyPlant
 
-from drakegrasp.config import CameraConfig, HandSource, PhysicsConfig
+from drakegrasp.arithmetic import Array
+from drakegrasp.config import CameraConfig, Config, HandSource, PhysicsConfig
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene, swap_object
 from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
 #: Number of cached scenes and renderers: a build needs those of two objects. For a hand with
@@ -60,6 +63,18 @@ def cached_scene(
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
     key = "scene", _digest(model.name, *shape, *mass), physics, hand
     return _cached(key, lambda: _make_scene(model, physics, hand, DIAGRAMS + more), KEPT + more)
+
+
+def run_cached(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -> TrialRecord:
+    """Return the record of an attempt in the cached scene of an object, see `run_attempt`.
+
+    A scene in which Drake failed is never used again.
+    """
+    scene = cached_scene(model, config.physics, config.hand_source, attempt.preshape)
+    record = run_attempt(scene, X_TO, attempt, config)
+    if record.outcome.inconclusive:
+        forget_scenes()
+    return record
 
 
 def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand, most: int) -> Scene:

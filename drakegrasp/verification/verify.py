@@ -31,8 +31,8 @@ from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import run_trial, start_of
-from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
-from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
+from drakegrasp.simulation.scene_cache import cached_scene, run_cached
+from drakegrasp.simulation.trial import TrialRecord, start_meetings
 from drakegrasp.verification.hints import fit_surface
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.result import PoseTrial, Verification
@@ -145,20 +145,15 @@ def _run(placed: PlacedObject, fit: WristFit, config: Config) -> tuple[Attempt, 
     Returns:
         The start of the trial, and its record.
     """
-    scene = cached_scene(placed.model, config.physics, config.hand_source)
     hand = load_hand(config.hand_source)
     least = coordinate_limits(hand)[1:, 0]
     for share in MARGINS:
         margin = share * np.deg2rad(config.verify.open_margin_deg) * hand.closing_unit
         closing = np.maximum(fit.closing - margin, least)
         pregrasp = Attempt(X_OG=fit.X_OG, spread=fit.spread, closing=closing)
-        trial = run_attempt(scene, placed.X_TO_simulated, pregrasp, config)
+        trial = run_cached(placed.model, placed.X_TO_simulated, pregrasp, config)
         if trial.outcome is not Outcome.START_COLLISION:
             break
-
-    # A scene in which Drake failed is never used again.
-    if trial.outcome.inconclusive:
-        forget_scenes()
     return pregrasp, trial
 
 

@@ -354,11 +354,11 @@ def test_fingers_are_opened_until_the_hand_is_clear(held, cube, monkeypatch, col
     """By the whole margin, then by half of it."""
     opened, ends = [], iter([Outcome.START_COLLISION] * collisions + [Outcome.SUCCESS])
 
-    def run(scene, X_TO, attempt, config):
+    def run(model, X_TO, attempt, config):
         opened.append(attempt.closing)
         return TrialRecord(outcome=next(ends), X_TO=X_TO, X_OG=attempt.X_OG)
 
-    monkeypatch.setattr(verifying, "run_attempt", run)
+    monkeypatch.setattr(verifying, "run_cached", run)
     config = override_config(CONFIG, ["verify.open_margin_deg=10"])
     pregrasp, trial = verifying._run(cube, held.fit, config)
     expected = [held.fit.closing - share * np.deg2rad(10.0) for share in shares]
