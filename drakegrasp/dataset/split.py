@@ -42,7 +42,7 @@ def split_samples(
 
     Args:
         objects: (n,), row of /objects of each sample.
-        names: Names of the objects' meshes, by row; a mesh with several seeds counts as one object.
+        names: Names of the objects, by row.
         classes: Classes of the objects, by row.
         groups: Groups of the objects, by row, equal for variants of the same mesh.
         homes: Split of each group of a split by object, see `find_homes`.
