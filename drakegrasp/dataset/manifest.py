@@ -329,7 +329,7 @@ def read_manifest(out: Path) -> Manifest:
         **{f.name: getattr(stored, f.name) for f in fields(Manifest) if f.name != "config"},
     )
     # What remains is a valid value that was changed.
-    if stored.sha256 not in (None, _digest(tree)):
+    if stored.sha256 != _digest(tree):
         raise DataError(
             f"{path}: must be as it was written, got one with another {DIGEST}: it is damaged, or "
             f"was edited (without the key {DIGEST} it is taken as it is)"
@@ -351,7 +351,7 @@ class _Stored(BaseModel):
     objects: tuple[ObjectEntry, ...]
     refused: tuple[RefusedMesh, ...]
     rejected: tuple[AttemptKey, ...] = ()
-    sha256: Hex | None = None
+    sha256: Hex
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:

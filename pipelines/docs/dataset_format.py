@@ -97,7 +97,7 @@ rests on the table then, and the forces of the fingertips need not balance.
 
 Files with the `schema_version` above can be read. Any other version is rejected with a message that
 names the file and both versions: build the dataset again, in another directory. The
-[changelog](../../CHANGELOG.md) states what each version changed.
+changelog states what each version changed.
 
 ## Seals
 

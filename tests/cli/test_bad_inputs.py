@@ -26,6 +26,7 @@ from helpers.datasets import OTO, REPEATED, TRIALS, make_dataset
 from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
+from drakegrasp.dataset.manifest import DIGEST, _digest
 from drakegrasp.hand.files import MODELS
 from drakegrasp.page.attempts import Attempts
 
@@ -73,11 +74,11 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (base / "meshes").mkdir()
     out = make_dataset(base / "out", base / "meshes", overrides=REPEATED)
     manifest = json.loads((out / MANIFEST).read_text())
-    del manifest["sha256"]  # other rules find what is wrong
     key = {"object": "1_box_a", "candidate": 0, "standoff_index": 0}
     manifest["refused"] = [{"name": "4_cup", "mesh_sha256": "0" * 64, "reason": "open"}]
     manifest["fingers"] = {"finger_1": True, "finger_2": True, "finger_3": True}
-    (base / "manifest.json").write_text(json.dumps({**manifest, "rejected": [key]}))
+    manifest["rejected"] = [key]
+    (base / "manifest.json").write_text(json.dumps({**manifest, DIGEST: _digest(manifest)}))
     (base / "reject.json").write_text(json.dumps({"version": 1, "rejected": [key], "kept": [key]}))
     return base
 

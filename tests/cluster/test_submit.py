@@ -333,8 +333,9 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
 def test_script_builds_what_a_plain_loop_builds(box: Path, tmp_path: Path) -> None:
     build(find_meshes(box), tmp_path / "here", load_config(overrides=TINY), run_here, show=False)
     command = [sys.executable, PIPELINES / "submit_build.py", "--objects", box, *TINY_OPTIONS]
-    out = tmp_path / "out"
-    options = ["--out", out, "--workers", "1", "--memory", "2GB"]
+    out, defaults = tmp_path / "out", tmp_path / "defaults.yaml"
+    defaults.write_text("seed: 0\n")
+    options = ["--out", out, "--workers", "1", "--memory", "2GB", "--config", defaults]
     result = subprocess.run([*command, *options], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "2 work units simulated" in result.stdout

@@ -93,6 +93,10 @@ def start_build(
         "--quiet",
     ]
     command += ["--objects", str(meshes), "--out", str(out), "--workers", str(workers)]
+    # The defaults, which have no name; a build without a configuration uses the preset fast.
+    defaults = out.parent / "defaults.yaml"
+    defaults.write_text("seed: 0\n")
+    command += ["--config", str(defaults)]
     for value in FAST:
         command += ["--set", value]
     command += arguments
