@@ -167,7 +167,7 @@ def assemble_locked(
                     group = file.create_group(name)
                     for f in _fields(manifest, DATA_FIELDS if camera else TRIAL_FIELDS):
                         create_field(group, f, f.row_shape(surveyed.sizes), count)
-            _write_table(files[""], "objects", OBJECT_FIELDS, _object_columns(manifest))
+            _write_table(files[""], "objects", OBJECT_FIELDS, object_columns(manifest))
             ids = surveyed.successes["trial_id"]
             successes = {"trial_id": ids, "removal": decisions.removal}
             _write_table(files[""], "successes", SUCCESS_FIELDS, successes)
@@ -220,8 +220,8 @@ def _fields(manifest: Manifest, fields: Sequence[Field]) -> tuple[Field, ...]:
     return stored_fields(fields, repeats=manifest.config.robustness.repeats > 0)
 
 
-def _object_columns(manifest: Manifest) -> dict[str, AnyArray]:
-    """Return the columns of /objects."""
+def object_columns(manifest: Manifest) -> dict[str, AnyArray]:
+    """Return the columns (n, ...) of /objects, in the order of the manifest."""
     columns = {}
     for field in OBJECT_FIELDS:
         own = [getattr(entry, field.name) for entry in manifest.objects]

@@ -22,7 +22,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
-from drakegrasp.dataset.assemble import file_attributes
+from drakegrasp.dataset.assemble import file_attributes, object_columns
 from drakegrasp.dataset.hdf5 import (
     DATA_TABLES,
     OF_CAMERA,
@@ -245,7 +245,7 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
                     fields=FILES[name][1][group],
                     attributes=look.attributes,
                     counts=counts,
-                    dataset=manifest if compared else None,
+                    dataset=manifest if compared or (known and name == TRIALS_FILE) else None,
                 )
                 tasks.append(partial(_check_rows, task))
     return found + other, tasks
@@ -376,8 +376,9 @@ class RowsTask:
         fields: Fields of the group.
         attributes: Attributes of the file.
         counts: Number of rows of the groups that the group's rows refer to, as far as known.
-        dataset: Manifest of the dataset around a data file whose samples are compared with their
-            trials and meshes; None to check the rows by themselves.
+        dataset: Manifest of the dataset around trials, whose objects are compared with it, or
+            around a data file, whose samples are compared with their trials and meshes; None to
+            check the rows by themselves.
     """
 
     path: Path
@@ -424,6 +425,8 @@ def _check_rows(task: RowsTask) -> list[Violation]:
         stages += [[_chain], [_in_mask]]
         if task.dataset is not None:
             stages += [[_of_sample], [_as_in_trials], [_on_mesh]]
+    elif task.group == "objects" and task.dataset is not None:
+        stages += [[_as_in_manifest]]
     found = list[Violation]()
     for checks in stages:
         sound = np.ones(t.count, dtype=np.bool_)
@@ -593,6 +596,20 @@ def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) ->
     with np.errstate(invalid="ignore"):
         near = np.abs(values - due) <= limit.reshape(-1, *(1,) * (values.ndim - 1))
     return _any(~(same | near))
+
+
+def _as_in_manifest(t: Table, task: RowsTask) -> Iterator[Finding]:
+    """Rows of /objects are the objects of the manifest."""
+    assert task.dataset is not None
+    due, count = object_columns(task.dataset), len(task.dataset.objects)
+    if task.counts[task.group] != count:
+        what = f"the group must have the {count} objects of {FILE_NAME}"
+        yield what, np.ones(t.count, dtype=np.bool_), np.full(t.count, task.counts[task.group])
+        return
+    for name, values in due.items():
+        if t.has(name):
+            bad = _differs(t[name], values[t[NUMBER]])
+            yield f"{name} must be that of {FILE_NAME}", bad, t[name]
 
 
 # What samples are

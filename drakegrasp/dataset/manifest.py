@@ -270,11 +270,11 @@ def write_manifest(manifest: Manifest, out: Path) -> None:
 def manifest_text(manifest: Manifest) -> bytes:
     """Return the bytes of a manifest's file."""
     content = _content(manifest)
-    content[DIGEST] = _digest(content)
+    content[DIGEST] = manifest_digest(content)
     return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
 
 
-def _digest(content: Mapping[str, Any]) -> str:
+def manifest_digest(content: Mapping[str, Any]) -> str:
     """Return the hash of a manifest's other keys; it does not depend on the layout of the file."""
     said = {key: value for key, value in content.items() if key != DIGEST}
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
@@ -329,10 +329,10 @@ def read_manifest(out: Path) -> Manifest:
         **{f.name: getattr(stored, f.name) for f in fields(Manifest) if f.name != "config"},
     )
     # What remains is a valid value that was changed.
-    if stored.sha256 != _digest(tree):
+    if stored.sha256 != manifest_digest(tree):
         raise DataError(
-            f"{path}: must be as it was written, got one with another {DIGEST}: it is damaged, or "
-            f"was edited (without the key {DIGEST} it is taken as it is)"
+            f"{path}: must be as it was written, got one with another {DIGEST}: it is damaged or "
+            "was edited"
         )
     return manifest
 

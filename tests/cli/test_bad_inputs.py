@@ -26,7 +26,7 @@ from helpers.datasets import OTO, REPEATED, TRIALS, make_dataset
 from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
-from drakegrasp.dataset.manifest import DIGEST, _digest
+from drakegrasp.dataset.manifest import DIGEST, manifest_digest
 from drakegrasp.hand.files import MODELS
 from drakegrasp.page.attempts import Attempts
 
@@ -78,7 +78,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     manifest["refused"] = [{"name": "4_cup", "mesh_sha256": "0" * 64, "reason": "open"}]
     manifest["fingers"] = {"finger_1": True, "finger_2": True, "finger_3": True}
     manifest["rejected"] = [key]
-    (base / "manifest.json").write_text(json.dumps({**manifest, DIGEST: _digest(manifest)}))
+    (base / "manifest.json").write_text(json.dumps({**manifest, DIGEST: manifest_digest(manifest)}))
     (base / "reject.json").write_text(json.dumps({"version": 1, "rejected": [key], "kept": [key]}))
     return base
 

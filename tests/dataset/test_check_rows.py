@@ -102,6 +102,17 @@ def test_a_removal_without_a_meaning_is_found(out: Path) -> None:
     must_find(out, (TRIALS, "/successes", 2, "removal must be one of 0, 1, 2"))
 
 
+def test_objects_of_trials_are_those_of_the_manifest(out: Path) -> None:
+    edits = {"name": lambda _: b"a\x1b]0;x\x07", "mass": lambda mass: 2.0 * mass}
+    for name, edit in edits.items():
+        change(out, TRIALS, f"objects/{name}", 1, edit)
+    must_find(
+        out,
+        *((TRIALS, "/objects", 1, f"{name} must be that of manifest.json") for name in edits),
+        of=TRIALS,
+    )
+
+
 PROPS, GRASP = "object_props/", "grasp_props/"
 SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
     # where it is, how it is broken, what is found

@@ -21,7 +21,13 @@ import trimesh
 from drakegrasp.config import MOST_PALMS, CameraConfig, Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
-from drakegrasp.dataset.manifest import DIGEST, Manifest, installed_versions, write_manifest
+from drakegrasp.dataset.manifest import (
+    DIGEST,
+    Manifest,
+    installed_versions,
+    manifest_digest,
+    write_manifest,
+)
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
 from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
@@ -363,10 +369,10 @@ def must_find(out: Path, *expected: tuple[str, str, int | None, str], of: str = 
 
 
 def edit_manifest(out: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
-    """Change what a manifest says by hand, and drop its hash: it is taken as it is."""
+    """Change what a manifest says, as if it had been written so."""
     tree = json.loads((out / FILE_NAME).read_bytes())
-    del tree[DIGEST]
     edit(tree)
+    tree[DIGEST] = manifest_digest(tree)
     (out / FILE_NAME).write_text(json.dumps(tree))
 
 
