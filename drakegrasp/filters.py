@@ -1,11 +1,11 @@
-"""Which successes become samples: the limits, the reasons, and the rules that apply them.
+"""Which successes become samples: the limits, the reasons, and the filters themselves.
 
 A `Filter` has the columns that it needs, and tells the rows that it rejects. A new filter is one
 entry in `FILTERS`, with its reason in `Removal` and its limit in `LIMITS`; the configuration, the
 writer, verdicts, `check` and the docs follow. A filter removes a grasp from the two data files, but
-never from trials.hdf5. A removal has one reason: the first rule that rejects the grasp. The filters
-of images and contacts are the paper's (Veres et al., "Postprocessing"); the filters of the hold are
-our own.
+never from trials.hdf5. A removal has one reason: the first filter that rejects the grasp. The
+filters of images and contacts are the paper's (Veres et al., "Postprocessing"); the filters of the
+hold are our own.
 
 All functions are pure functions of arrays. The module imports only NumPy.
 """
@@ -123,7 +123,7 @@ class Limits(Protocol):
 
     @property
     def require(self) -> str:
-        """`held` switches the rules of the hold off."""
+        """`held` switches the filters of the hold off."""
 
     def __getattr__(self, name: str) -> Any: ...
 
@@ -137,7 +137,7 @@ class Filter:
         needs: Names of the columns that it uses; it is not applied to a table without one of them.
         refuses: Given a table of n rows and the limits, returns the rows (n,) that it rejects.
         limit: Name of the limit that can switch it off; empty if it is always on.
-        of_hold: Whether it judges the hold; `require: held` switches such rules off.
+        of_hold: Whether it judges the hold; `require: held` switches such filters off.
     """
 
     removal: Removal
@@ -147,7 +147,7 @@ class Filter:
     of_hold: bool = False
 
     def is_on(self, limits: Limits) -> bool:
-        """Return whether the limits switch the rule on."""
+        """Return whether the limits switch the filter on."""
         if self.of_hold and limits.require == "held":
             return False
         if not self.limit:
@@ -165,7 +165,7 @@ def at_most(
     of_hold: bool = False,
     by_finger: bool = False,
 ) -> Filter:
-    """Return the rule that a value, times `scale`, is at most a limit; it rejects NaN.
+    """Return the filter that a value, times `scale`, is at most a limit; it rejects NaN.
 
     With `by_finger`, the value is a number per finger (n, k), and that of each used finger counts.
     """
@@ -179,7 +179,7 @@ def at_most(
 
 
 def _not_finite(column: str) -> Filter:
-    """Return the rule that each contact of a used finger has a finite point and normal."""
+    """Return the filter that each contact of a used finger has a finite point and normal."""
 
     def refuses(t: Table, limits: Limits) -> Flags:
         # The contact of an unused finger is NaN. The mean normal of opposed patches has length
@@ -191,7 +191,7 @@ def _not_finite(column: str) -> Filter:
 
 
 def _unless(removal: Removal, column: str) -> Filter:
-    """Return the rule that a flag is set."""
+    """Return the filter that a flag is set."""
     return Filter(removal=removal, needs=(column,), refuses=lambda t, limits: ~t[column])
 
 
@@ -226,21 +226,21 @@ FILTERS = (
     at_most(Removal.ANOMALOUS, "normal_sum", "max_normal_sum"),
     at_most(Removal.NEAR_CONE, "slip_use", "max_slip_use", by_finger=True),
 )
-#: The columns that the rules use.
-NEEDED = tuple(dict.fromkeys(name for rule in FILTERS for name in rule.needs))
+#: The columns that the filters use.
+NEEDED = tuple(dict.fromkeys(name for each in FILTERS for name in each.needs))
 
 
 def first_removal(
-    t: Table, limits: Limits, rules: Sequence[Filter] = FILTERS
+    t: Table, limits: Limits, filters: Sequence[Filter] = FILTERS
 ) -> npt.NDArray[np.uint8]:
-    """Return the reason of the first rule that rejects each row, `KEPT` (n,) if no rule does.
+    """Return the reason of the first filter that rejects each row, `KEPT` (n,) if no filter does.
 
-    A rule is left out if it is off or the table lacks one of its columns.
+    A filter is left out if it is off or the table lacks one of its columns.
     """
     removal = np.full(t.count, Removal.KEPT, dtype=np.uint8)
-    for rule in rules:
-        if rule.is_on(limits) and t.has(*rule.needs):
-            removal[rule.refuses(t, limits) & (removal == Removal.KEPT)] = rule.removal
+    for each in filters:
+        if each.is_on(limits) and t.has(*each.needs):
+            removal[each.refuses(t, limits) & (removal == Removal.KEPT)] = each.removal
     return removal
 
 

@@ -2,8 +2,8 @@
 
 Input: rows of `/trials` and `/looks`. Output: a table with the identity of each attempt, columns of
 its rows, and the columns below, each of which one function derives; a column whose sources are
-missing is left out. From it follows the `Removal` of each: by the rules of `filters`, user-defined
-filters, outliers and rejections.
+missing is left out. From it follows the `Removal` of each: by our filters, user-defined filters,
+outliers and rejections.
 """
 
 from __future__ import annotations
@@ -208,8 +208,8 @@ TRIAL_COLUMNS = tuple(
 def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
     """Return what filters and splits need of n successes of a work unit.
 
-    `trial_id` is the row in the unit's /trials, `object` is 0, and `by_rule` is the reason of the
-    first rule that rejects the success: it is judged once, here.
+    `trial_id` is the row in the unit's /trials, `object` is 0, and `by_filter` is the reason of the
+    first filter that rejects the success: it is judged once, here.
 
     Args:
         rows: Columns of the successes' rows of `/trials` and `/looks`, by their names there;
@@ -221,7 +221,7 @@ def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
     successes = t.only(*COPIED).with_columns(derived, object=np.zeros(t.count, dtype=np.int32))
     if t.has("row"):
         successes = successes.with_columns(trial_id=t["row"].astype(np.int64))
-    return successes.with_columns(by_rule=first_removal(successes, config.filters))
+    return successes.with_columns(by_filter=first_removal(successes, config.filters))
 
 
 # Removals
@@ -248,7 +248,7 @@ def judge_successes(
         ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
     """
     # Filters that judge each grasp by itself.
-    removal = successes["by_rule"].copy()
+    removal = successes["by_filter"].copy()
     own = _removed_by_own(config, successes)
     removal[own & (removal == Removal.KEPT)] = Removal.OWN
 
@@ -268,7 +268,7 @@ def judge_successes(
 
 
 def own_filters(config: FilterConfig) -> list[_Keep]:
-    """Return the filters that the configuration names: classes in files, or rules of packages.
+    """Return the filters that the configuration names: classes in files, or those of packages.
 
     Raises:
         ConfigError: If a filter cannot be imported, or is not a filter.
@@ -280,15 +280,15 @@ def _own_filter(name: str, config: FilterConfig) -> _Keep:
     if is_own_class(name):
         found = own_class(name, config.code, key=_OWN, method="keep", takes=("successes",))
         return lambda successes: found().keep(successes)
-    rule = registry.find("filters", name)
-    if not isinstance(rule, Filter):
-        raise ConfigError(f"filters: {name} must be a Filter, got {type(rule).__name__}")
+    named = registry.find("filters", name)
+    if not isinstance(named, Filter):
+        raise ConfigError(f"filters: {name} must be a Filter, got {type(named).__name__}")
 
     def keep(successes: Table) -> Flags:
-        if missing := [column for column in rule.needs if not successes.has(column)]:
+        if missing := [column for column in named.needs if not successes.has(column)]:
             columns = listed(sorted(successes.names))
             raise ConfigError(f"{name}: needs must be some of {columns}, got {listed(missing)}")
-        return np.asarray(~rule.refuses(successes, config))
+        return np.asarray(~named.refuses(successes, config))
 
     return keep
 

@@ -309,7 +309,7 @@ def judge_sample(
         X_TG = multiply(trial.X_TO, trial.X_OG)
         for name, pose in _CAMERA_POSES.items():
             columns[f"X_TC_{name}"] = pack_pose(pose(X_TG, config.camera))[None]
-    return Removal(int(successes_of(Table(columns), config)["by_rule"][0]))
+    return Removal(int(successes_of(Table(columns), config)["by_filter"][0]))
 
 
 #: Columns of the filters that need the images of a success.

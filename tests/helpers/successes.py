@@ -47,5 +47,5 @@ def judge(
     successes: Table, config: FilterConfig, rejected: Sequence[int] = ()
 ) -> npt.NDArray[np.uint8]:
     """Return why each is no sample, by the rules and by what needs all of them."""
-    by_rule = first_removal(successes, config)
-    return judge_successes(successes.with_columns(by_rule=by_rule), config, rejected)
+    by_filter = first_removal(successes, config)
+    return judge_successes(successes.with_columns(by_filter=by_filter), config, rejected)

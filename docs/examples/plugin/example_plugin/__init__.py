@@ -21,7 +21,7 @@ HAND = Path(__file__).with_name("jaw_hand.yaml")
 #: The text of the exporter in `drakegrasp export --help`.
 HELP = "a line of JSON per sample: object, palm pose, joints"
 
-#: A rule decides which rows of a table are removed: here objects that turned in the hand.
+#: A filter decides which rows of a table are removed: here objects that turned in the hand.
 CALM = Filter(
     removal=Removal.OWN,
     needs=("turn",),
