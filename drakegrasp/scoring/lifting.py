@@ -4,7 +4,7 @@ Input: the starts of grasps in {T}, and two solids that were guessed from the ob
 points (`mesh.cloud`), with or without the view that shows them. Output: for each grasp the share of
 its lifts that end as a sample, and the chance that it is a sample on the real object. A grasp is
 lifted on both completed solids (`vision.completion`); if one of these lifts is a sample, it is also
-lifted with the palm aside and with less friction. Mass, friction and all rules are those of the
+lifted with the palm aside and with less friction. Mass, friction and filters are those of the
 configuration.
 """
 
@@ -67,7 +67,7 @@ def place_completed(
     Args:
         solids: Solids, see `mesh.cloud`.
         view: The image that shows the object; None if it is not known.
-        config: The rules of the lifts, and the mass of the object.
+        config: The configuration of the lifts, with the mass of the object.
 
     Raises:
         TooLittleSeenError: If no solid is left.

@@ -29,6 +29,7 @@ from helpers.datasets import (
 
 from drakegrasp.dataset.assemble import IMAGES
 from drakegrasp.dataset.hdf5 import AnyArray
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import DATA_FIELDS
 from drakegrasp.frames import invert_pose, pack_pose, unpack_pose
 
@@ -111,6 +112,22 @@ def test_objects_of_trials_are_those_of_the_manifest(out: Path) -> None:
         *((TRIALS, "/objects", 1, f"{name} must be that of manifest.json") for name in edits),
         of=TRIALS,
     )
+
+
+def test_trials_have_the_objects_of_the_manifest_alone(out: Path) -> None:
+    def add(file: h5py.File) -> None:
+        group = file["objects"]
+        for name in [*group]:
+            values, attrs = group[name][:], dict(group[name].attrs)
+            dtype = group[name].dtype
+            del group[name]
+            group.create_dataset(name, data=np.append(values, values[:1]), dtype=dtype)
+            group[name].attrs.update(attrs)
+
+    count = len(read_manifest(out).objects)
+    edit_file(out / TRIALS, add)
+    what = f"the group must have the {count} objects of manifest.json"
+    must_find(out, (TRIALS, "/objects", 0, what), of=TRIALS)
 
 
 PROPS, GRASP = "object_props/", "grasp_props/"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from drakegrasp.vision.camera import look_at
+from drakegrasp.vision.completion import View
+from drakegrasp.vision.depth_image import cloud_from_depth
 
 #: A camera of 160 x 120 pixels, which looks at a box on a table, with a wall behind the table.
 K = np.array([[150.0, 0.0, 80.0], [0.0, 152.0, 58.0], [0.0, 0.0, 1.0]])
@@ -34,3 +36,14 @@ def image(noise=0.0, table=True, offset=BEHIND):
     depth[::17] = np.nan
     depth[5::19] = 0.0
     return depth.reshape(HIGH, WIDE), mask.reshape(HIGH, WIDE)
+
+
+def box_view():
+    """Return the view of the box, with unknown pixels on it and beside it."""
+    depth, mask = image()
+    return View(depth=depth, mask=mask, K=K, X_TC=X_TC)
+
+
+def cloud_of(view):
+    """Return the visible points and normals of a view's object, in {T}."""
+    return cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.depth_images import X_TC, K, image
+from helpers.depth_images import X_TC, K, box_view, cloud_of
 
 import drakegrasp as dg
 from drakegrasp.scoring.predicting import _predict_view, _SceneView, predict
-from drakegrasp.vision.completion import View
-from drakegrasp.vision.depth_image import cloud_from_depth
 
 CONFIG = dg.load_config("fast", ["objects.mass=0.3"])
 
@@ -17,13 +15,12 @@ CONFIG = dg.load_config("fast", ["objects.mass=0.3"])
 @pytest.fixture(scope="module")
 def view():
     """A box on a table before a wall, 80 x 60 mm wide and 100 mm high."""
-    depth, mask = image()
-    return View(depth=depth, mask=mask, K=K, X_TC=X_TC)
+    return box_view()
 
 
 @pytest.fixture(scope="module")
 def cloud(view):
-    return cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
+    return cloud_of(view)
 
 
 def test_grasps_come_with_the_best_first(cloud):

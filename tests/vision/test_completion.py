@@ -5,25 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from helpers.depth_images import BOX, X_TC, K, image
+from helpers.depth_images import BOX, box_view, cloud_of
 
 from drakegrasp.errors import TooLittleSeenError
 from drakegrasp.mesh.cloud import column_solid, hull_solid, read_cloud
 from drakegrasp.mesh.surfaces import is_solid_surface
-from drakegrasp.vision.completion import View, complete
-from drakegrasp.vision.depth_image import cloud_from_depth
+from drakegrasp.vision.completion import complete
 
 
 @pytest.fixture(scope="module")
 def view():
     """A box of 80 x 60 x 100 mm, with unknown pixels on it and beside it."""
-    depth, mask = image()
-    return View(depth=depth, mask=mask, K=K, X_TC=X_TC)
+    return box_view()
 
 
 @pytest.fixture(scope="module")
 def cloud(view):
-    return read_cloud(cloud_from_depth(view.depth, view.K, view.mask, view.X_TC))
+    return read_cloud(cloud_of(view))
 
 
 def mesh_of(solid):
