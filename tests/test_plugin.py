@@ -18,7 +18,7 @@ from helpers.objects import box_model
 from helpers.successes import good, judge
 
 from drakegrasp import registry
-from drakegrasp.cluster.choice import cluster_of
+from drakegrasp.cluster.kinds import cluster_of
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset, read_closed_grasps

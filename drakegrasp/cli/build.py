@@ -87,8 +87,7 @@ def submit(
         script: Only write the script of a job.
     """
     from drakegrasp.api.building import known_work
-    from drakegrasp.cluster.choice import cluster_of, describe, present
-    from drakegrasp.cluster.kinds import Running
+    from drakegrasp.cluster.kinds import Running, cluster_of, describe, present
 
     options: dict[str, Any] = dict(workers=workers, cores=cores, memory=memory, walltime=walltime)
     options |= dict(interface=interface, host=host)

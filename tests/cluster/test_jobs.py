@@ -18,8 +18,8 @@ from helpers.golden import Golden
 from helpers.tiers import few
 
 from drakegrasp.cli.arguments import validate_existing, validate_existing_file
-from drakegrasp.cluster.choice import cluster_of, describe
 from drakegrasp.cluster.connect import dask_settings
+from drakegrasp.cluster.kinds import cluster_of, describe
 from drakegrasp.errors import ConfigError, MachineError
 
 pytest.importorskip("dask_jobqueue")

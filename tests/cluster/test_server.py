@@ -20,9 +20,9 @@ from helpers.scripts import PIPELINES
 from server.processes import wait_until
 from server.slurm import PARTITION, queued_jobs, running_slurm
 
-from drakegrasp.cluster import jobqueue as jobs
-from drakegrasp.cluster.choice import cluster_of
+from drakegrasp.cluster import kinds
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
+from drakegrasp.cluster.kinds import cluster_of
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
@@ -138,7 +138,7 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
 
     for name in ("SLURM_CONF", "SBATCH_EXPORT"):
         monkeypatch.setenv(name, slurm[name])
-    monkeypatch.setattr(jobs, "REFILL_SECONDS", 2.0)
+    monkeypatch.setattr(kinds, "REFILL_SECONDS", 2.0)
     # Over the defaults of dask-jobqueue, which another test's import may have read already.
     yaml = dask.config.collect(paths=[slurm["DASK_CONFIG"]], env={})
     settings_of_site = dask.config.merge(dask.config.config, yaml)

@@ -28,10 +28,8 @@ from helpers.scripts import PIPELINES, load_script
 
 import drakegrasp
 from drakegrasp import registry
-from drakegrasp.cluster.choice import cluster_of
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT, connect, made_or_given, make_certificates
-from drakegrasp.cluster.jobqueue import Jobs
-from drakegrasp.cluster.kinds import Local
+from drakegrasp.cluster.kinds import Jobs, Local, cluster_of
 from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.hand.settings import load_config
