@@ -11,19 +11,23 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Unpack
 
-from drakegrasp.cluster.connect import Workers, dashboard_line, has_dashboard, joined
+from drakegrasp.cluster.connect import Workers, dashboard_line, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.cluster.wire import by_wire
 from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import BUILD_PRESET, Config
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
-from drakegrasp.errors import DataError, GraspError, counted
+from drakegrasp.errors import DataError, GraspError, MeshError, counted, listed
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.foreign_files import validate_local
-from drakegrasp.generation.directory import BuildDirectory, open_directory
+from drakegrasp.generation.directory import (
+    BUILTIN,
+    BuildDirectory,
+    build_config,
+    open_directory,
+)
 from drakegrasp.generation.pipeline import BuildReport, build
-from drakegrasp.generation.request import BUILTIN, build_config, validate_known
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -128,8 +132,8 @@ def _workers_of(
     """
     out, config = directory.out, directory.manifest.config
     with running as client:
-        if show and has_dashboard() and client.dashboard_link:
-            sys.stderr.write(f"{dashboard_line(client)}\n")
+        if show:
+            sys.stderr.write(dashboard_line(client))
         meshes = [source.path for source in sources]
         with checked_workers(client, config, out, meshes) as travels:
             execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
@@ -181,7 +185,8 @@ def _asked(
     else:
         sources = find_meshes(objects, units=units, manifest=manifest)
         names = [source.name for source in sources]
-    validate_known(only, names)
+    if unknown := [name for name in only if name not in names]:
+        raise MeshError(f"only must be names of objects ({listed(names)}), got {unknown[0]!r}")
     chosen = [name for name in names if not only or name in only]
     if postures is not None:
         postures = postures.refuse(unknown_objects(postures, names))

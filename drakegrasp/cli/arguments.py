@@ -178,7 +178,7 @@ class What:
     def _resolved(self) -> Config:
         """Return the configuration, in which options are short forms of `--set`."""
         from drakegrasp.config import BUILD_PRESET
-        from drakegrasp.generation.request import BUILTIN
+        from drakegrasp.generation.directory import BUILTIN
 
         builtin = given(per_class=self.per_class, seed=self.objects_seed)
         if builtin and self.objects != BUILTIN:

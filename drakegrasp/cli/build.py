@@ -108,7 +108,7 @@ def submit(
     if dry_run or script is not None:
         _give_script(cluster, out, script)
         return
-    joint = present(cluster.connected(out), show)
+    joint = present(cluster.connected(out))
     print_report(dg.build_dataset(**asked, out=out, cluster=joint, show=show))
 
 

@@ -180,15 +180,12 @@ def dask_settings() -> dict[str, Any]:
 
 
 def dashboard_line(client: Client) -> str:
-    """Return a line with the link to the cluster's dashboard, or with how to install it."""
-    if not has_dashboard():
-        return "dashboard: not installed (pip install 'drakegrasp[dashboard]')"
-    return f"dashboard: {client.dashboard_link}"
+    """Return a line with the link to the cluster's dashboard; empty if there is none.
 
-
-def has_dashboard() -> bool:
-    """Return whether Dask can serve its dashboard in this environment."""
-    return importlib.util.find_spec("bokeh") is not None
+    Dask needs bokeh to serve it, and workers on this machine have none.
+    """
+    there = client.dashboard_link and importlib.util.find_spec("bokeh") is not None
+    return f"dashboard: {client.dashboard_link}\n" if there else ""
 
 
 def connect(

@@ -40,7 +40,6 @@ from drakegrasp.cluster.connect import (
     chosen_security,
     closing_cluster,
     connect,
-    dashboard_line,
     dask_settings,
     made_or_given,
     security_of,
@@ -102,11 +101,9 @@ def describe(cluster: Local) -> list[str]:
 
 
 @contextmanager
-def present(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
-    """Enter a cluster, print the address of its dashboard, and wait for its first worker."""
+def present(cluster: AbstractContextManager[Client]) -> Iterator[Client]:
+    """Enter a cluster, and wait for its first worker."""
     with cluster as client:
-        if show and client.dashboard_link:  # workers on this machine have none
-            sys.stderr.write(f"{dashboard_line(client)}\n")
         if not client.nthreads():
             sys.stderr.write("waiting for the first worker\n")
             client.wait_for_workers(1)

@@ -1,10 +1,12 @@
-"""The directory in which a build works, from its lock to its last file.
+"""What a build begins with: a configuration that ends, and the directory in which it works.
 
-Input: a path and the configuration of a build. Output: while the block runs, a directory that this
-process holds, that contains the hand, and whose manifest the build completes. A directory that
-cannot be used is rejected before any worker starts. `DatasetTask` is what the tasks of a build have
-in common: plain data, and the files of the directory that they use. A worker that does not see the
-directory gets copies of these files, see `FileTask` of `drakegrasp.runtime.executor`.
+Input: a path, and the configuration that a caller states. Output: while the block runs, a directory
+that this process holds, that contains the hand, and whose manifest the build completes. A
+configuration or a directory that cannot be used is rejected before any worker starts.
+
+`DatasetTask` is what the tasks of a build have in common: plain data, and the files of the
+directory that they use. A worker that does not see the directory gets copies of these files, see
+`FileTask` of `drakegrasp.runtime.executor`.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-from drakegrasp.config import CarriedHand, Config
+from drakegrasp.config import MOST_PALMS, CarriedHand, Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -25,11 +27,66 @@ from drakegrasp.dataset.manifest import (
     release_directory,
 )
 from drakegrasp.dataset.paths import FILE_NAME, places
-from drakegrasp.errors import DataError, counted, listed
+from drakegrasp.dataset.successes import own_filters
+from drakegrasp.errors import ConfigError, DataError, counted, listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand, hand_places, moved_hand
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
+from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.candidates import validate_samplers
+from drakegrasp.simulation.drive import drive_of
+
+#: Name that requests the built-in objects instead of a directory of meshes.
+BUILTIN = "builtin"
+#: Number of samples of each object that a build makes if nothing else ends it.
+SAMPLES_PER_OBJECT = 20
+
+
+def build_config(config: Config, postures: Attempts | None = None) -> Config:
+    """Return the configuration of a build, which ends and names its postures.
+
+    Without a target and a number of palm poses, samplers without an end would go on for hours, so
+    each object then ends with `SAMPLES_PER_OBJECT` samples.
+
+    Args:
+        config: Configuration that the caller states.
+        postures: Postures to try instead of palm poses of samplers.
+
+    Raises:
+        ConfigError: If the configuration names other postures, or a class that cannot be used.
+        HandError: If the hand cannot be used, or a sampler cannot be used with it.
+    """
+    config = _with_postures(config, postures)
+    rules = config.candidates
+    endless = "closing" in rules.method and rules.postures is None
+    if endless and rules.max == MOST_PALMS and not config.has_target:
+        config = config.model_copy(update={"samples_per_object": SAMPLES_PER_OBJECT})
+
+    # The hand, and classes that are not of this package.
+    drive_of(load_hand(config.hand_source), config.lift)
+    if rules.postures is None:
+        validate_samplers(config)
+    own_filters(config.filters)
+    return config
+
+
+def _with_postures(config: Config, postures: Attempts | None) -> Config:
+    """Return a configuration that names the given postures.
+
+    Raises:
+        ConfigError: If it names other postures.
+    """
+    digest, named = None if postures is None else postures.digest(), config.candidates.postures
+    if named not in (None, digest):
+        must = "left out; the postures that are given decide" if digest else "given with postures"
+        raise ConfigError(f"candidates.postures must be {must}, got {named!r}")
+    if digest is None:
+        return config
+    # A posture has no stand-off, so there is one attempt per posture.
+    rules = config.candidates
+    changed = {"postures": digest, "standoffs": rules.standoffs[:1]}
+    return config.model_copy(update={"candidates": rules.model_copy(update=changed)})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,7 +30,7 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset
 from drakegrasp.frames import unpack_pose
-from drakegrasp.generation.request import build_config
+from drakegrasp.generation.directory import build_config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config

@@ -28,8 +28,8 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
+from drakegrasp.generation.directory import build_config
 from drakegrasp.generation.replay import replay_trial
-from drakegrasp.generation.request import build_config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel, prepare_object

@@ -23,9 +23,9 @@ from drakegrasp.dataset.schema import NO_PRESHAPE
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import make_pose
+from drakegrasp.generation.directory import build_config
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.generation.replay import replay_trial
-from drakegrasp.generation.request import build_config
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions

@@ -15,9 +15,8 @@ from helpers import faults
 
 from drakegrasp.config import Config
 from drakegrasp.generation import pipeline
-from drakegrasp.generation.directory import open_directory
+from drakegrasp.generation.directory import build_config, open_directory
 from drakegrasp.generation.pipeline import BuildReport
-from drakegrasp.generation.request import build_config
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.runtime.executor import Executor
 from drakegrasp.simulation.attempts import Attempts
