@@ -1,7 +1,7 @@
 """How an attempt can end, and how far it got: the enums that all files share.
 
-This module has the properties of an outcome that need no attempt. `drakegrasp.simulation.verdict`
-and `drakegrasp.simulation.trial` decide when an attempt has an outcome.
+This module has the properties of an outcome that need no attempt. `drakegrasp.simulation.trial`
+decides when an attempt has an outcome.
 """
 
 from __future__ import annotations

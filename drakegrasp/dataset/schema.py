@@ -378,7 +378,7 @@ _WORDS = (
           "whether the attempt is a precision grasp with slip below 5 mm and turn below 5 deg"),
 )
 
-#: The conditions of an attempt, drawn or not: everything that `simulation.conditions` may change.
+#: The conditions of an attempt, drawn or not: everything that `simulation.attempt` may change.
 CONDITION_FIELDS: tuple[Field, ...] = (
     *_measured(
         "conditions.materials",
@@ -409,8 +409,8 @@ CONDITION_FIELDS: tuple[Field, ...] = (
           of="conditions.sensor.seed"),
 )
 
-#: How often a sample survives noise; see `drakegrasp.simulation.robustness`. Missing in files of
-#: builds without repeats, see `stored_fields`.
+#: How often a sample survives noise; see `simulation.attempt.disturbed`. Missing in files of builds
+#: without repeats, see `stored_fields`.
 ROBUST_FIELDS: tuple[Field, ...] = tuple(
     replace(field, stage=Stage.LIFTED, some=True, optional=True)
     for field in (

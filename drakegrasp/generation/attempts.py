@@ -30,10 +30,9 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
-from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.attempt import Attempt, Conditions, draw_conditions, usual_conditions
 from drakegrasp.simulation.attempts import posture_attempts
 from drakegrasp.simulation.candidates import palm_attempts
-from drakegrasp.simulation.conditions import Conditions, draw_conditions, usual_conditions
 from drakegrasp.simulation.scene import Scene, hand_joint_names
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, centred, predict

@@ -59,8 +59,7 @@ from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import atomic_path, disk_full_named, new_hdf5
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.conditions import Conditions, conditions_from, usual_materials
+from drakegrasp.simulation.attempt import Conditions, Source, conditions_from, usual_materials
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
 from drakegrasp.vision.rendering import Renderer, paint, render

@@ -50,8 +50,8 @@ from drakegrasp.runtime.journal import (
     inject_fault,
     open_journal,
 )
-from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.robustness import is_drawn, repeat_disturbed
+from drakegrasp.simulation.attempt import Attempt, is_drawn
+from drakegrasp.simulation.scene_cache import repeat_disturbed
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.table import AnyArray, Table

@@ -27,8 +27,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.cloud import Solid
 from drakegrasp.objects.model import object_of
 from drakegrasp.runtime.environment import one_thread
-from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.conditions import usual_conditions
+from drakegrasp.simulation.attempt import Attempt, usual_conditions
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene_cache import run_cached
 from drakegrasp.vision.completion import View, complete

@@ -24,8 +24,9 @@ from drakegrasp.mesh.cloud import Solid
 from drakegrasp.mesh.surfaces import even_points, on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream
+from drakegrasp.simulation.attempt import palm_motion
 from drakegrasp.simulation.closing import close_on
-from drakegrasp.simulation.palms import DEEPER, Palms, Shape, palm_motion
+from drakegrasp.simulation.palms import DEEPER, Palms, Shape
 from drakegrasp.simulation.screen import centre
 
 #: Number of surface points around which palms are made.

@@ -74,7 +74,7 @@ from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.conditions import Materials
+from drakegrasp.simulation.attempt import Materials
 from drakegrasp.simulation.scene import Motor, ObjectScene, Scene, joint_limits
 from drakegrasp.vision.camera import object_colour
 

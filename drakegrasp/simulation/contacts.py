@@ -360,7 +360,7 @@ class ClearanceMonitor:
             self._states.append(np.concatenate([X_TG[2], hand_positions(scene)]))
             self._scene = scene
 
-    def clearance(self) -> float:
+    def least(self) -> float:
         """Return the smallest height of the hand above the table's top [m]; negative below it.
 
         It is NaN if it is not measured.
@@ -370,6 +370,14 @@ class ClearanceMonitor:
         states = _between(np.array(self._states))
         names = hand_joint_names(self._scene)
         return least_height(self._scene.hand, names, states[:, 4:], states[:, :4])
+
+
+def scrapes(clearance: float, rules: CloseConfig) -> bool:
+    """Return whether a hand with this clearance [m] was deeper below the table's top than allowed.
+
+    A hand whose clearance was not measured, NaN, was not.
+    """
+    return rules.scrape_depth is not None and clearance < -rules.scrape_depth
 
 
 def least_height(hand: Hand, names: list[str], q: Array, up_G: Array) -> float:

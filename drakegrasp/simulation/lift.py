@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drakegrasp.arithmetic import multiply, norm
-from drakegrasp.config import Config
+from drakegrasp.config import Config, LiftConfig
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
 from drakegrasp.hand.finger_sweep import pad_points
 from drakegrasp.simulation.construction import copy_materials
@@ -46,7 +46,6 @@ from drakegrasp.simulation.scene import (
     transfer_state,
 )
 from drakegrasp.simulation.screen import extra_margin
-from drakegrasp.simulation.verdict import is_lost_sample
 
 #: An object that moved less than this in the hand since the last check is still held [m], [rad].
 HELD_SHIFT, HELD_ANGLE = 5e-4, np.deg2rad(0.5)
@@ -107,8 +106,8 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     # `scene` takes fine steps; `current` is the scene that takes the steps that are needed now.
     now, current, monitor, used = start, scene, _Monitor(scene), [scene]
     slip_released, turn_released, certain, moved = 0.0, 0.0, False, False
-    way = ClearanceMonitor(config.close)
-    way.look(scene)
+    clearance = ClearanceMonitor(config.close)
+    clearance.look(scene)
     try:
         # Free the object in the hand; later the wrist moves to its target.
         release(scene)
@@ -125,7 +124,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             limits.advance(current, check - margin - current.time)
             certain = monitor.update(current, check - now, config.close.stop_speed)
             now = check
-            way.look(current)
+            clearance.look(current)
 
             # Measure how far the object moved in the hand, in total and before the wrist moves.
             X_GO = _object_in_hand(current)
@@ -133,7 +132,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             if now <= motion.begin:
                 slip_released, turn_released = slip, turn
             if now < end and not certain:
-                moved = bool(is_lost_sample(slip, turn, config.lift))
+                moved = is_lost_sample(slip, turn, config.lift)
 
             # Choose the next step size, and move the state to the diagram that has it.
             if now < end and not certain and not moved:
@@ -161,7 +160,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         slip_released=slip_released,
         turn_released=turn_released,
         moved=moved,
-        clearance=way.clearance(),
+        clearance=clearance.least(),
     )
 
 
@@ -262,6 +261,18 @@ def _motion(X_GO_before: Array, X_GO: Array) -> tuple[float, float]:
     """Return by how much the object moved [m] and turned [rad] in the hand."""
     shift = float(norm(X_GO[:3, 3] - X_GO_before[:3, 3]))
     return shift, rotation_angle(multiply(invert_pose(X_GO_before), X_GO)[:3, :3])
+
+
+def is_lost_sample(slip: float, turn: float, rules: LiftConfig) -> bool:
+    """Return whether a lift ends at a check because the grasp can no longer be a sample.
+
+    Args:
+        slip: Distance that the object has moved in the hand since it is free [m].
+        turn: Angle that the object has turned in the hand [rad].
+        rules: When lifts end.
+    """
+    too_far = slip > rules.stop_slip or np.degrees(turn) > rules.stop_turn_deg
+    return rules.stop_when == "lost_sample" and bool(too_far)
 
 
 #: Peak speed of a minimum-jerk motion divided by its mean speed (Flash and Hogan, 1985).

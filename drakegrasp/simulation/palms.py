@@ -194,20 +194,6 @@ def distinct(palms: list[Palm]) -> list[Palm]:
     return kept
 
 
-def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
-    """Return a random pose (4, 4) of a palm in its frame before the motion.
-
-    Args:
-        numbers: (6,), normal random numbers: along the axes, then about the axes.
-        shift: Standard deviation along each axis [m].
-        turn: Standard deviation of each component of the rotation vector [rad].
-    """
-    vector = turn * numbers[3:]
-    angle = float(norm(vector))
-    axis = vector / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
-    return make_pose(rotation_about(axis, angle), shift * numbers[:3])
-
-
 def _rotation_z(degrees: float) -> Array:
     return rotation_about([0.0, 0.0, 1.0], np.deg2rad(degrees))
 

@@ -21,12 +21,19 @@ import numpy.typing as npt
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.arithmetic import Array
-from drakegrasp.config import CameraConfig, Config, HandSource, PhysicsConfig
+from drakegrasp.config import (
+    CameraConfig,
+    Config,
+    HandSource,
+    PhysicsConfig,
+    with_whole_lifts,
+)
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.attempt import Attempt, disturbed, usual_conditions
 from drakegrasp.simulation.construction import build_scene, swap_object
 from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.screen import centred
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
@@ -75,6 +82,27 @@ def run_cached(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config
     if record.outcome.inconclusive:
         forget_scenes()
     return record
+
+
+def repeat_disturbed(
+    model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config
+) -> list[TrialRecord]:
+    """Return the records of disturbed repeats; inconclusive repeats are left out.
+
+    Repeats use the time step of the trial and are lifted to the end. The stored trial is not one.
+
+    Args:
+        model: The object.
+        X_TO: Resting pose of the object, (4, 4).
+        attempt: A lifted attempt; the noise is relative to its friction and mass.
+        config: The rules; `robustness` has the number of repeats.
+    """
+    # Whether a grasp holds is decided by a whole lift.
+    config, hand = with_whole_lifts(config), load_hand(config.hand_source)
+    known = attempt.conditions or usual_conditions(model, config.physics)
+    repeats = centred(model, hand, list(disturbed(attempt, known, config.robustness.repeats)))
+    records = [run_cached(model, X_TO, each, config) for each in repeats]
+    return [record for record in records if not record.outcome.inconclusive]
 
 
 def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand, most: int) -> Scene:

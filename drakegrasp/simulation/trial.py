@@ -7,19 +7,19 @@ A failure of the physics is an outcome, not an exception. So is an error in Drak
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.config import Config
+from drakegrasp.config import CloseConfig, Config
 from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.conditions import Materials, usual_materials
+from drakegrasp.simulation.attempt import Attempt, Materials, usual_materials
 from drakegrasp.simulation.construction import set_materials
 from drakegrasp.simulation.contacts import (
     ClearanceMonitor,
@@ -27,6 +27,7 @@ from drakegrasp.simulation.contacts import (
     open_hand_collides,
     open_hand_meets,
     read_contacts,
+    scrapes,
 )
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import Lift, lift
@@ -43,19 +44,15 @@ from drakegrasp.simulation.scene import (
     start_limits,
 )
 from drakegrasp.simulation.screen import Prediction, predict
-from drakegrasp.simulation.verdict import (
-    is_precision,
-    is_stable,
-    judge_closed,
-    judge_lifted,
-    scrapes,
-)
 
 #: Far below a time step, and far above the rounding error of a sum of time steps [s].
 ROUNDING = 1e-9
 #: A finger has missed the object if it closed this far beyond the last angle at which it can meet
 #: the object, in the unit of its closing joint.
 BEYOND = np.deg2rad(2.0)
+#: In a stable grasp, the object moves and turns in the hand by less than this [m], [rad]; own
+#: choice.
+STABLE_SLIP, STABLE_TURN = 5e-3, float(np.deg2rad(5.0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,21 +90,66 @@ class TrialRecord:
     X_OG: Array
     closed: Closed | None = None
     lift: Lift | None = None
-    message: str = field(default="")
+    message: str = ""
 
     @property
     def precision(self) -> bool:
         """Whether the object is held, and only by the fingertips."""
-        lift = self.lift
-        return lift is not None and bool(is_precision(self.outcome, lift.contacts.other_links))
+        held, lift = self.outcome is Outcome.SUCCESS, self.lift
+        return held and lift is not None and not lift.contacts.other_links
 
     @property
     def stable(self) -> bool:
         """Whether it is a precision grasp that moves less than 5 mm and 5 degrees in the hand."""
         lift = self.lift
-        return lift is not None and bool(
-            is_stable(self.outcome, lift.contacts.other_links, lift.slip, lift.turn)
-        )
+        still = lift is not None and lift.slip < STABLE_SLIP and lift.turn < STABLE_TURN
+        return self.precision and still
+
+
+def judge_closed(
+    touching: npt.ArrayLike,
+    other_links: int,
+    hand_on_table: bool,
+    *,
+    required: npt.ArrayLike = True,
+    scraped: bool = False,
+) -> Outcome:
+    """Return the outcome of a closed hand: `SUCCESS` if it may lift.
+
+    The first rule that applies decides.
+
+    Args:
+        touching: (k,), whether each fingertip touches the object.
+        other_links: Number of other links of the hand that touch the object.
+        hand_on_table: Whether the hand touches the table.
+        required: (k,), whether each fingertip must touch the object; one value applies to all.
+        scraped: Whether the hand was too far below the table's top, see `scrapes`.
+    """
+    if np.any(required & ~np.asarray(touching)):
+        return Outcome.MISSING_FINGERTIP
+    if other_links:
+        return Outcome.HAND_CONTACT
+    return Outcome.TABLE_CONTACT if hand_on_table or scraped else Outcome.SUCCESS
+
+
+def judge_lifted(
+    touching: npt.ArrayLike,
+    other_links: int,
+    object_on_table: bool,
+    *,
+    required: npt.ArrayLike = True,
+    scraped: bool = False,
+) -> Outcome:
+    """Return the outcome of an attempt after the lift: `SUCCESS` if the hand holds the object.
+
+    The first rule that applies decides; the arguments are those of `judge_closed`.
+    """
+    if not np.any(touching) and not other_links:
+        return Outcome.DROPPED
+    if np.any(required & ~np.asarray(touching)):
+        partly = np.any(touching) and not object_on_table
+        return Outcome.PARTLY_HELD if partly else Outcome.SLIPPED
+    return Outcome.TABLE_CONTACT if object_on_table or scraped else Outcome.SUCCESS
 
 
 def run_attempt(
@@ -223,20 +265,20 @@ def _close(
 ) -> TrialRecord:
     """Close the hand on the static object, and return the record; a success may lift."""
     # Start just before the fingers meet something, if geometry has found where.
-    way = ClearanceMonitor(config.close)
-    way.look(scene)
+    clearance = ClearanceMonitor(config.close)
+    clearance.look(scene)
     if prediction is not None:
         _place(scene, start.X_TO, attempt, prediction.closing)
-        way.look(scene)
+        clearance.look(scene)
     if attempt.path is not None and attempt.own_motors:
-        _follow_path(scene, limits, config, attempt.path, way)
+        _follow_path(scene, limits, config.close, attempt.path, clearance)
     else:
-        _close_fingers(scene, limits, config, prediction, way)
+        _close_fingers(scene, limits, config.close, prediction, clearance)
     closed = Closed(
         contacts=read_contacts(scene),
         q=hand_positions(scene),
         duration=scene.time,
-        clearance=way.clearance(),
+        clearance=clearance.least(),
     )
 
     # It lifts only an object that is held by all fingertips and nothing else.
@@ -247,18 +289,15 @@ def _close(
         required=scene.hand.required,
         scraped=scrapes(closed.clearance, config.close),
     )
-    return replace(start, closed=closed, outcome=Outcome(int(verdict)))
+    return replace(start, closed=closed, outcome=verdict)
 
 
 def _lift(scene: Scene, record: TrialRecord, config: Config, limits: TrialLimits) -> TrialRecord:
     """Lift the object in the closed hand, and return the record."""
     end = lift(scene, limits, config)
-    record = replace(record, lift=end)
-
-    # All fingertips must still hold the object, clear of the table. A lift that ended because the
-    # object moved has no such verdict.
+    # A lift that ended because the object moved has no verdict on what the hand holds.
     if end.moved:
-        return replace(record, outcome=Outcome.MOVED)
+        return replace(record, lift=end, outcome=Outcome.MOVED)
     verdict = judge_lifted(
         end.contacts.touching,
         end.contacts.other_links,
@@ -266,37 +305,32 @@ def _lift(scene: Scene, record: TrialRecord, config: Config, limits: TrialLimits
         required=scene.hand.required,
         scraped=scrapes(end.clearance, config.close),
     )
-    return replace(record, outcome=Outcome(int(verdict)))
+    return replace(record, lift=end, outcome=verdict)
 
 
 def _close_fingers(
     scene: Scene,
     limits: TrialLimits,
-    config: Config,
+    rules: CloseConfig,
     prediction: Prediction | None,
-    way: ClearanceMonitor,
+    clearance: ClearanceMonitor,
 ) -> None:
     """Close the fingers on the static object until they stop or a required finger has missed it."""
     # Closing that geometry skipped counts as time; an angle beyond the last contact is a miss.
-    end, last = config.close.max_time, np.array(np.inf)
+    end, last, hand = rules.max_time, np.array(np.inf), scene.hand
     if prediction is not None:
-        hand = scene.hand
         end -= float((prediction.closing / hand.closing_speed).min())
         # A fingertip that is not required does not end the attempt if it misses the object.
         last = np.where(hand.required, prediction.last + BEYOND * hand.closing_unit, np.inf)
 
-    # The last check may be before the end by a rounding error, but never by a step.
-    while end - scene.time > ROUNDING:
-        limits.advance(scene, min(config.close.check_period, end - scene.time))
-        way.look(scene)
-        stopped = finger_speed(scene) < config.close.stop_speed
-        closing = multiply(scene.hand.closing_ratio, closing_angles(scene))
-        if stopped or np.any(closing > last):
+    for _ in _checks(scene, limits, rules, end, clearance):
+        stopped = finger_speed(scene) < rules.stop_speed
+        if stopped or np.any(multiply(hand.closing_ratio, closing_angles(scene)) > last):
             break
 
 
 def _follow_path(
-    scene: Scene, limits: TrialLimits, config: Config, path: Array, way: ClearanceMonitor
+    scene: Scene, limits: TrialLimits, rules: CloseConfig, path: Array, clearance: ClearanceMonitor
 ) -> None:
     """Move each joint by its own motor to the grasp and on to the squeeze, until all have stopped.
 
@@ -313,9 +347,17 @@ def _follow_path(
     command_joints(scene, times.tolist(), [places[0], *(places[i + 1] for i in stages)])
 
     # The joints stop when they press on the object or are at their targets.
-    end = float(times[-1]) + config.close.max_time
-    while end - scene.time > ROUNDING:
-        limits.advance(scene, min(config.close.check_period, end - scene.time))
-        way.look(scene)
-        if scene.time > times[-1] and finger_speed(scene) < config.close.stop_speed:
+    for _ in _checks(scene, limits, rules, float(times[-1]) + rules.max_time, clearance):
+        if scene.time > times[-1] and finger_speed(scene) < rules.stop_speed:
             break
+
+
+def _checks(
+    scene: Scene, limits: TrialLimits, rules: CloseConfig, end: float, clearance: ClearanceMonitor
+) -> Iterator[None]:
+    """Simulate from check to check of closing fingers until a time [s]."""
+    # The last check may be before the end by a rounding error, but never by a step.
+    while end - scene.time > ROUNDING:
+        limits.advance(scene, min(rules.check_period, end - scene.time))
+        clearance.look(scene)
+        yield

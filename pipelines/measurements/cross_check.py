@@ -38,8 +38,7 @@ from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.runtime.environment import one_thread, require_mujoco
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.conditions import Materials, usual_conditions
+from drakegrasp.simulation.attempt import Attempt, Materials, usual_conditions
 from drakegrasp.simulation.drive import drive_of
 
 T = TypeVar("T")

@@ -24,12 +24,11 @@ from drakegrasp.hand.kinematics import within_load
 from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.conditions import Materials, usual_materials
+from drakegrasp.simulation.attempt import Attempt, Materials, usual_materials
 from drakegrasp.simulation.contacts import MAX_BESIDE
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import lift_duration
-from drakegrasp.simulation.verdict import judge_closed, judge_lifted
+from drakegrasp.simulation.trial import judge_closed, judge_lifted
 
 #: Time steps between two checks while closing, and while lifting.
 CLOSING_STRIDE, LIFTING_STRIDE = 25, 50
@@ -158,8 +157,8 @@ class MujocoBaseline:
         verdict = judge_closed(
             closed.touching, closed.other_links, closed.hand_on_table, required=self._hand.required
         )
-        if verdict != Outcome.SUCCESS:
-            return PeerTrial(outcome=Outcome(int(verdict)))
+        if verdict is not Outcome.SUCCESS:
+            return PeerTrial(outcome=verdict)
 
         # Lift, and judge what the hand then holds.
         X_GO = self._object_in_hand()
@@ -173,7 +172,7 @@ class MujocoBaseline:
         )
         motion = invert_pose(X_GO) @ self._object_in_hand()
         return PeerTrial(
-            outcome=Outcome(int(verdict)),
+            outcome=verdict,
             lifted=True,
             slip=float(np.linalg.norm(motion[:3, 3])),
             turn=rotation_angle(motion[:3, :3]),

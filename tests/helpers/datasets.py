@@ -38,8 +38,8 @@ from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.files import SEAL_SIZE, seal
+from drakegrasp.simulation.attempt import draw_conditions
 from drakegrasp.simulation.candidates import Candidates
-from drakegrasp.simulation.conditions import draw_conditions
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.vision.depth_sensor import spoil_depth
 

@@ -28,15 +28,19 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
+from drakegrasp.simulation.attempt import (
+    PALM_SHIFT,
+    PALM_TURN,
+    _noise_factor,
+    draw_conditions,
+    palm_motion,
+)
 from drakegrasp.simulation.candidates import (
     Drawing,
     normal_candidates,
     palm_attempts,
     rotation_candidates,
 )
-from drakegrasp.simulation.conditions import draw_conditions
-from drakegrasp.simulation.palms import palm_motion
-from drakegrasp.simulation.robustness import PALM_SHIFT, PALM_TURN, _noise_factor
 from drakegrasp.simulation.screen import predict
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 

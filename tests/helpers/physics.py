@@ -15,15 +15,9 @@ from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.objects.model import load_object
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.simulation.conditions import draw_conditions
-from drakegrasp.simulation.verdict import (
-    is_lost_sample,
-    is_precision,
-    is_stable,
-    judge_closed,
-    judge_lifted,
-    scrapes,
-)
+from drakegrasp.simulation.attempt import draw_conditions
+from drakegrasp.simulation.contacts import scrapes
+from drakegrasp.simulation.trial import STABLE_SLIP, STABLE_TURN, judge_closed, judge_lifted
 
 #: As exact as the poses: the angle of a rotation close to the identity is less exact than a matrix.
 MOTION = 1e-4  # [m], [rad]
@@ -40,17 +34,27 @@ def broken_physics(out: Path) -> dict[str, list[int]]:
     # The verdict follows from contacts, clearance and motion.
     required = np.array([*json.loads(Trials(out).attributes["fingers"]).values()] or [True])
     required = required & ~unused_fingers(trials["unused"], trials["closed_touching"].shape[1])
-    closed = judge_closed(
-        *(trials[f"closed_{name}"] for name in ("touching", "other_links", "hand_on_table")),
-        required=required,
-        scraped=scrapes(trials["clearance_close"], config.close),
+    judges = {
+        "close": (judge_closed, ("closed_touching", "closed_other_links", "closed_hand_on_table")),
+        "lift": (judge_lifted, ("lifted_touching", "lifted_other_links", "lifted_object_on_table")),
+    }
+    closed, due = (
+        np.array(
+            [
+                judge(*of_row, required=fingers, scraped=scrapes(clearance, config.close))
+                for *of_row, fingers, clearance in zip(
+                    *(trials[name] for name in names),
+                    required,
+                    trials[f"clearance_{when}"],
+                    strict=True,
+                )
+            ]
+        )
+        for when, (judge, names) in judges.items()
     )
-    due = judge_lifted(
-        *(trials[f"lifted_{name}"] for name in ("touching", "other_links", "object_on_table")),
-        required=required,
-        scraped=scrapes(trials["clearance_lift"], config.close),
-    )
-    lost = is_lost_sample(trials["slip"], trials["turn"], config.lift)
+    slipped, turned = trials["slip"], np.degrees(trials["turn"])
+    lost = (slipped > config.lift.stop_slip) | (turned > config.lift.stop_turn_deg)
+    lost &= config.lift.stop_when == "lost_sample"
     due = np.where((outcome == Outcome.MOVED) & lost, outcome, due)
     due = np.where(closed != Outcome.SUCCESS, closed, due)
     stage = np.array([Outcome(code).stage for code in outcome.tolist()])
@@ -64,9 +68,9 @@ def broken_physics(out: Path) -> dict[str, list[int]]:
     turn = np.arccos(np.clip(cosine, -1.0, 1.0))
     for name, motion in (("slip", slip), ("turn", turn)):
         rules[name] = lifted & ~(np.abs(trials[name] - motion) <= MOTION)
-    links = trials["lifted_other_links"]
-    rules["precision"] = lifted & (trials["precision"] != is_precision(outcome, links))
-    stable = is_stable(outcome, links, trials["slip"], trials["turn"])
+    precision = (outcome == Outcome.SUCCESS) & (trials["lifted_other_links"] == 0)
+    stable = precision & (trials["slip"] < STABLE_SLIP) & (trials["turn"] < STABLE_TURN)
+    rules["precision"] = lifted & (trials["precision"] != precision)
     rules["stable"] = lifted & (trials["stable"] != stable)
 
     # Fingertips that hold an object push into it.

@@ -16,7 +16,7 @@ from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.conditions import usual_conditions
+from drakegrasp.simulation.attempt import usual_conditions
 
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")

@@ -11,7 +11,7 @@ from drakegrasp.config import Config
 from drakegrasp.frames import rotation_angle
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.conditions import Conditions, draw_conditions, usual_conditions
+from drakegrasp.simulation.attempt import Conditions, draw_conditions, usual_conditions
 
 COUNT = 400
 #: The preset that draws everything.

@@ -12,8 +12,7 @@ from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.conditions import Materials, usual_conditions
+from drakegrasp.simulation.attempt import Attempt, Materials, usual_conditions
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.config import Config
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.conditions import usual_conditions
-from drakegrasp.simulation.robustness import disturbed, is_drawn, repeat_disturbed
+from drakegrasp.simulation.attempt import disturbed, is_drawn, usual_conditions
+from drakegrasp.simulation.scene_cache import repeat_disturbed
 
 pytestmark = pytest.mark.sim
 
@@ -39,35 +39,19 @@ def test_same_grasp_has_the_same_repeats_and_one_in_the_air_others(cube, config)
     assert Outcome.SUCCESS not in dict(outcomes(cube, config, height=0.25))
 
 
-class Seen:
-    """What the repeats run, with nothing simulated."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *ends: Outcome) -> None:
-        self.physics, self.configs, self.attempts, self.forgotten = [], [], [], []
-        outcomes = iter(ends)
-
-        def scene(model, physics, source, preshape):
-            self.physics.append(physics)
-            return SimpleNamespace()
-
-        def end(_scene, _X_TO, attempt, config):
-            self.configs.append(config)
-            self.attempts.append(attempt)
-            return SimpleNamespace(outcome=next(outcomes, Outcome.SUCCESS))
-
-        module = "drakegrasp.simulation.robustness"
-        monkeypatch.setattr(f"{module}.cached_scene", scene)
-        monkeypatch.setattr(f"{module}.run_attempt", end)
-        monkeypatch.setattr(f"{module}.forget_scenes", lambda: self.forgotten.append(1))
-
-
 def test_repeats_are_lifted_to_their_end_with_the_trials_step(cube, config, monkeypatch):
     """Whether a grasp holds is not known of a lift that ends when its sample is lost."""
-    seen = Seen(monkeypatch)
+    seen = list[Config]()
+
+    def end(_model, _X_TO, _attempt, config):
+        seen.append(config)
+        return SimpleNamespace(outcome=Outcome.SUCCESS)
+
+    monkeypatch.setattr("drakegrasp.simulation.scene_cache.run_cached", end)
     rules = override_config(config, ["lift.stop_when=lost_sample"])
     repeat_disturbed(cube, standing(cube), from_above(cube, STANDOFF), rules)
-    assert [each.lift.stop_when for each in seen.configs] == ["never"] * 2
-    assert seen.physics == [config.physics] * 2
+    assert [each.lift.stop_when for each in seen] == ["never"] * 2
+    assert [each.physics for each in seen] == [config.physics] * 2
 
 
 def test_draw_is_the_attempts_own_and_of_its_probability(cube):

@@ -1,23 +1,19 @@
-"""The verdict's rules, one attempt at a time and many at once."""
+"""The rules of the verdict: which one decides, and their limits."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from helpers.verdicts import some_contacts, some_trial
 
 from drakegrasp.config import CloseConfig
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.verdict import (
-    STABLE_SLIP,
-    STABLE_TURN,
-    is_lost_sample,
-    is_precision,
-    is_stable,
-    judge_closed,
-    judge_lifted,
-    scrapes,
-)
+from drakegrasp.simulation.contacts import scrapes
+from drakegrasp.simulation.lift import is_lost_sample
+from drakegrasp.simulation.trial import judge_closed, judge_lifted
 
 ALL, ONE_OFF, NONE = [True, True, True], [True, False, True], [False, False, False]
 
@@ -47,35 +43,31 @@ ALL, ONE_OFF, NONE = [True, True, True], [True, False, True], [False, False, Fal
 )
 def test_first_rule_that_applies_decides(judge, touching, other_links, on_table, outcome) -> None:
     """Only fingertips may touch what a closed hand lifts; all hold it in the end, off the table."""
-    assert judge(touching, other_links, on_table) == outcome
+    assert judge(touching, other_links, on_table) is outcome
 
 
 @pytest.mark.parametrize(
-    ("outcome", "other_links", "slip", "turn", "precision", "stable"),
+    ("outcome", "other_links", "slip", "turn_deg", "precision", "stable"),
     [
         (Outcome.SUCCESS, 0, 0.0, 0.0, True, True),
-        (Outcome.SUCCESS, 0, 4.9e-3, np.deg2rad(4.9), True, True),
+        (Outcome.SUCCESS, 0, 4.9e-3, 4.9, True, True),
         # The limits themselves are beyond.
         (Outcome.SUCCESS, 0, 5e-3, 0.0, True, False),
-        (Outcome.SUCCESS, 0, 0.0, STABLE_TURN, True, False),
+        (Outcome.SUCCESS, 0, 0.0, 5.0, True, False),
         # On the palm nothing is stable.
         (Outcome.SUCCESS, 1, 0.0, 0.0, False, False),
         (Outcome.SLIPPED, 0, 0.0, 0.0, False, False),
-        # Before the lift the motion is NaN.
-        (Outcome.MISSING_FINGERTIP, 0, np.nan, np.nan, False, False),
     ],
 )
 def test_stable_is_a_precision_grasp_that_stays(
-    outcome: Outcome,
-    other_links: int,
-    slip: float,
-    turn: float,
-    precision: bool,
-    stable: bool,
+    outcome, other_links, slip, turn_deg, precision, stable
 ) -> None:
-    assert is_precision(outcome, other_links) == precision
-    assert is_stable(outcome, other_links, slip, turn) == stable
-    assert STABLE_SLIP == 5e-3
+    lifted = some_contacts(other_links=other_links)
+    motion = {"outcome": outcome, "slip": slip, "turn": np.deg2rad(turn_deg)}
+    trial = some_trial(np.eye(4), some_contacts(), lifted, **motion)
+    assert (trial.precision, trial.stable) == (precision, stable)
+    # Before the lift there is no motion.
+    assert not replace(trial, lift=None).stable
 
 
 @pytest.mark.parametrize(
@@ -96,16 +88,15 @@ def test_sample_is_lost_beyond_either_limit_where_that_ends_lifts(
         assert is_lost_sample(slip, turn, rules) == ends
 
 
-def test_hand_that_scraped_the_table_is_refused_last() -> None:
+@pytest.mark.parametrize(
+    ("clearance", "depth", "scraped"),
+    [(-6e-4, 5e-4, True), (-5e-4, 5e-4, False), (np.nan, 5e-4, False), (-1.0, None, False)],
+)
+def test_hand_that_scraped_the_table_is_refused_last(clearance, depth, scraped) -> None:
     """Where nothing else refuses it; one that was not measured is not refused."""
-    rules = CloseConfig(scrape_depth=5e-4)
-    scraped = scrapes([-6e-4, -5e-4, np.nan, -6e-4], rules)
-    assert scraped.tolist() == [True, False, False, True]
-    assert not scrapes(-1.0, CloseConfig(scrape_depth=None))
-    touching = np.array([ALL, ALL, ALL, [True, False, True]])
-    none = np.zeros(4, dtype=bool)
-    ends = (Outcome.TABLE_CONTACT, Outcome.SUCCESS, Outcome.SUCCESS)
-    closed = judge_closed(touching, none, none, scraped=scraped)
-    assert closed.tolist() == [*ends, Outcome.MISSING_FINGERTIP]
-    lifted = judge_lifted(touching, none, none, scraped=scraped)
-    assert lifted.tolist() == [*ends, Outcome.PARTLY_HELD]
+    assert scrapes(clearance, CloseConfig(scrape_depth=depth)) == scraped
+    due = Outcome.TABLE_CONTACT if scraped else Outcome.SUCCESS
+    assert judge_closed(ALL, 0, False, scraped=scraped) is due
+    assert judge_lifted(ALL, 0, False, scraped=scraped) is due
+    assert judge_closed(ONE_OFF, 0, False, scraped=scraped) is Outcome.MISSING_FINGERTIP
+    assert judge_lifted(ONE_OFF, 0, False, scraped=scraped) is Outcome.PARTLY_HELD
