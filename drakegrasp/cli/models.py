@@ -130,7 +130,7 @@ def new_hand(
         packages: Folder of package://NAME/.
     """
     from drakegrasp.hand.draft.fingers import Answers
-    from drakegrasp.hand_setup.new import draft_hand
+    from drakegrasp.hand_setup import draft_hand
 
     # The user's answers.
     answers = Answers(
@@ -174,7 +174,7 @@ def check_hand_file(hand_file: Name, /, *, picture: NewFile | None = None) -> No
         hand_file: Name of a hand that comes with the package, or a hand file (YAML).
         picture: Write a picture of the hand, open and closed, with pads and palm frame.
     """
-    from drakegrasp.hand_setup.check import check_hand
+    from drakegrasp.hand_setup import check_hand
 
     findings = check_hand(hand_file, report=_print)
 

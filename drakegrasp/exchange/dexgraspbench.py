@@ -17,7 +17,7 @@ joint positions in the order of `joint_names` and the units of `joint_units`, ra
 
 Keys that the benchmark does not read state the conditions under which the sample held: `hand`,
 `preshape`, `trial_id`, `start_qpos` (the joints of the open hand) and `conditions` (friction of
-hand and table, mass). All poses are in {T}, with the object on the table. `mjcf.links` builds the
+hand and table, mass). All poses are in {T}, with the object on the table. `mjcf` builds the
 hand; its gains, torques and damping are those of the benchmark's Shadow Hand. The object of a
 prediction is at `PlacedObject.X_TO_simulated`. Contacts become the posture of the first wrist pose
 that fits them. A grasp without pregrasp or squeeze gets the postures described above.
@@ -74,7 +74,7 @@ OBJECTS = ASSETS / "objects"
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write the files and return the number of samples; see `export.export_dataset`."""
     require_mujoco("mujoco", "coacd")
-    from drakegrasp.mjcf.decomposition import convex_parts
+    from drakegrasp.mjcf import convex_parts
 
     # Write the hand under a name that the benchmark does not use.
     hand = load_hand(read_manifest(out).config.hand_source)
@@ -108,7 +108,7 @@ class BenchFiles:
             hand: The hand.
             folder: Folder to which object paths in the files are relative.
         """
-        from drakegrasp.mjcf.links import make_hand_model, write_hand_model
+        from drakegrasp.mjcf import make_hand_model, write_hand_model
 
         model = make_hand_model(hand)
         self.posed = StillScene(hand)
@@ -339,7 +339,7 @@ def write_grasps(
 
 def _write_parts(task: tuple[ObjectModel, Path, Path | None]) -> None:
     """Decompose an object into convex parts and write them."""
-    from drakegrasp.mjcf.decomposition import convex_parts, kept_convex_parts
+    from drakegrasp.mjcf import convex_parts, kept_convex_parts
 
     model, folder, keep = task
     write_object(folder, convex_parts(model) if keep is None else kept_convex_parts(model, keep))

@@ -22,8 +22,13 @@ from drakegrasp.exchange.export import ClosedGrasp, samples_by_object
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text
-from drakegrasp.mjcf.decomposition import convex_parts
-from drakegrasp.mjcf.links import MEMORY, make_hand_model, pair_friction, set_inertia
+from drakegrasp.mjcf import (
+    MEMORY,
+    convex_parts,
+    make_hand_model,
+    pair_friction,
+    set_inertia,
+)
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -18,8 +19,9 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.linalg import block_diag
 
 from drakegrasp.config import Config
+from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
-from drakegrasp.hand.description import FINGER_DAMPING, Hand
+from drakegrasp.hand.description import FINGER_DAMPING, Hand, load_hand
 from drakegrasp.hand.finger_sweep import (
     Opposition,
     closing_path,
@@ -94,6 +96,30 @@ class Finding:
 def judge(name: str, faults: Sequence[str], fine: str) -> Finding:
     """Return the finding of a check: its faults, or the text `fine` if there are none."""
     return Finding(name=name, ok=not faults, text="; ".join(faults) or fine)
+
+
+def check_files(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
+    """Yield the findings of the checks without a simulation, see `check_hand`."""
+    # The files: without them there is no hand.
+    try:
+        hand = load_hand(name_or_yaml)
+        count = sum(map(len, link_shapes(hand.model).values()))
+    except HandError as error:
+        own = f"{Path(name_or_yaml).absolute()}: "
+        yield judge("files", [str(error).removeprefix(own)], "")
+        return
+    joints, model = len(hand.joint_names), hand.model.path.name
+    fine = f"{hand.num_fingers} fingers, {joints} joints, {count} shapes in {model}"
+    yield judge("files", [], fine)
+
+    # Masses, limits and couplings. The other checks close the hand, for which they need its limits.
+    yield check_masses(hand)
+    limits = check_limits(hand)
+    yield limits
+    yield check_couplings(hand)
+    if limits.ok:
+        yield check_efforts(hand, config)
+        yield from check_geometry(hand)
 
 
 def check_masses(hand: Hand) -> Finding:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from drakegrasp.errors import HandError, MeshError, one_line
 from drakegrasp.frames import Array
-from drakegrasp.mjcf.links import make_spec
+from drakegrasp.mjcf import make_spec
 from drakegrasp.protocols.files import ObjectFolder
 from drakegrasp.protocols.protocol import MujocoProtocol
 

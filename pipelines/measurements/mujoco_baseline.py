@@ -21,7 +21,7 @@ from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle
 from drakegrasp.hand.description import load_plain_hand
 from drakegrasp.hand.kinematics import within_load
-from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
+from drakegrasp.mjcf import TIME_STEP, pair_friction, quaternion
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt, Materials, usual_materials

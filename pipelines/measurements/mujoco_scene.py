@@ -16,13 +16,13 @@ from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import SLIDE, Hand
 from drakegrasp.hand.parsing import joint_slides
-from drakegrasp.mjcf.decomposition import convex_parts
-from drakegrasp.mjcf.links import (
+from drakegrasp.mjcf import (
     RIGID,
     STIFF,
     TIME_STEP,
     add_couplings,
     add_links,
+    convex_parts,
     make_spec,
     pair_friction,
     set_inertia,

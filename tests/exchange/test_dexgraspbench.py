@@ -21,7 +21,7 @@ from drakegrasp.exchange.export import ClosedGrasp  # noqa: E402
 from drakegrasp.frames import Array, multiply  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.hand.kinematics import fingertip_poses  # noqa: E402
-from drakegrasp.mjcf.links import make_hand_model  # noqa: E402
+from drakegrasp.mjcf import make_hand_model  # noqa: E402
 from drakegrasp.pictures.still_scene import StillScene  # noqa: E402
 
 

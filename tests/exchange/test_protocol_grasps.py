@@ -17,6 +17,7 @@ from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
+from drakegrasp import mjcf
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.exchange.dexgraspbench import OBJECTS, fitted_postures, write_grasps
 from drakegrasp.exchange.export import ClosedGrasp
@@ -25,7 +26,6 @@ from drakegrasp.grasp import pack_grasp
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
-from drakegrasp.mjcf import decomposition
 from drakegrasp.runtime import environment
 from drakegrasp.simulation.attempts import quaternion_poses
 from drakegrasp.simulation.construction import build_scene
@@ -128,17 +128,17 @@ def test_the_parts_of_an_object_are_cut_once(
     model = box_model(tmp_path, [0.06] * 3)
     parts = [np.full((4 + k, 3), 0.1 * k) for k in range(11)]
     cut: list[Any] = []
-    monkeypatch.setattr(decomposition, "convex_parts", lambda each: cut.append(each) or parts)
+    monkeypatch.setattr(mjcf, "convex_parts", lambda each: cut.append(each) or parts)
     for _ in range(2):
-        found = decomposition.kept_convex_parts(model, tmp_path / "keep")
+        found = mjcf.kept_convex_parts(model, tmp_path / "keep")
         assert all(np.array_equal(a, b) for a, b in zip(parts, found, strict=True))
     assert cut == [model]
 
     # Another object, and other rules.
     other = replace(model, collision_faces=model.collision_faces[::-1].copy())
-    decomposition.kept_convex_parts(other, tmp_path / "keep")
-    monkeypatch.setitem(decomposition.SETTINGS, "threshold", 0.03)
-    decomposition.kept_convex_parts(other, tmp_path / "keep")
+    mjcf.kept_convex_parts(other, tmp_path / "keep")
+    monkeypatch.setitem(mjcf.SETTINGS, "threshold", 0.03)
+    mjcf.kept_convex_parts(other, tmp_path / "keep")
     assert cut == [model, other, other]
 
 
@@ -152,11 +152,11 @@ DAMAGE: dict[str, Callable[[Path], None]] = {
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_file_of_parts_is_written_again(damage: str, tmp_path: Path) -> None:
     model, keep = box_model(tmp_path, [0.06] * 3), tmp_path / "keep"
-    parts = decomposition.kept_convex_parts(model, keep)
+    parts = mjcf.kept_convex_parts(model, keep)
     (path,) = keep.iterdir()
     content = path.read_bytes()
     DAMAGE[damage](path)
-    again = decomposition.kept_convex_parts(model, keep)
+    again = mjcf.kept_convex_parts(model, keep)
     assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
     assert path.read_bytes() == content
 
@@ -244,7 +244,7 @@ def test_score_by_a_protocol_says_so_on_the_card(
     # Convex parts stay in its folder: another score there cuts none.
     assert list((tmp_path / "card" / "convex_parts").iterdir())
     (tmp_path / "card" / "verdicts.jsonl").unlink()
-    monkeypatch.setattr(decomposition, "convex_parts", pytest.fail)
+    monkeypatch.setattr(mjcf, "convex_parts", pytest.fail)
     result = run(*given[:-2])
     assert result.exit_code == 0, result.output
     assert json.loads((tmp_path / "card" / "card.json").read_text()) == card

@@ -14,7 +14,7 @@ from helpers.tiers import in_second_tier
 from drakegrasp.hand.checks import Finding
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS, hand_names
-from drakegrasp.hand_setup.check import check_hand
+from drakegrasp.hand_setup import check_hand
 from drakegrasp.verification.wrist_problem import hand_constants
 
 
@@ -129,7 +129,7 @@ FAULTS = {
 def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Files and geometry decide, but in tests that are marked."""
     if "sim" not in request.keywords:
-        monkeypatch.setattr("drakegrasp.hand_setup.check.GRASPS", ())
+        monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
 
 
 def refuse(path: Path, check: str, message: str) -> None:

@@ -16,7 +16,7 @@ from drakegrasp.hand.checks import check_palm
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand_setup.check import LINES, check_grasp, trial_grasps
+from drakegrasp.hand_setup import LINES, check_grasp, trial_grasps
 
 
 def changed_franka(folder: Path, edit: Callable[[dict], None]) -> Hand:

@@ -9,7 +9,7 @@ import trimesh
 from helpers.golden import Golden, points, rounded
 from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, write_model
 
-from drakegrasp.hand_setup.new import draft_hand
+from drakegrasp.hand_setup import draft_hand
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ def test_draft(
     suffix: str,
 ) -> None:
     """The hand file with its comments, the model, the meshes, notes and findings."""
-    monkeypatch.setattr("drakegrasp.hand_setup.new.GRASPS", ())
+    monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
     model = write_model(tmp_path / "vendor", text, f"{name}.{suffix}")
     drafted = draft_hand(model, tmp_path / "out")
     lines = [*drafted.notes, *(f"{f.ok} {f.name}: {f.text}" for f in drafted.findings)]

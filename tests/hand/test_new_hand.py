@@ -20,14 +20,14 @@ from drakegrasp.hand.file_format import DrivenBy
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.finger_sweep import pad_points_at
 from drakegrasp.hand.kinematics import closed_positions, fingertip_forces
-from drakegrasp.hand_setup.new import NewHand, draft_hand
+from drakegrasp.hand_setup import NewHand, draft_hand
 
 
 @pytest.fixture(autouse=True)
 def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Geometry decides, but in tests that are marked."""
     if "sim" not in request.keywords:
-        monkeypatch.setattr("drakegrasp.hand_setup.new.GRASPS", ())
+        monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
 
 
 def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -> NewHand:

@@ -13,7 +13,7 @@ from helpers.tiers import in_second_tier
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.finger_sweep import find_opposition, find_pinch, reach
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand_setup.check import GRASPS, check_grasp, trial_grasps
+from drakegrasp.hand_setup import GRASPS, check_grasp, trial_grasps
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import hand_positions
@@ -102,7 +102,7 @@ def test_trial_grasps_are_lifted_to_their_end(monkeypatch) -> None:
         still = SimpleNamespace(slip=0.0, turn=0.0)
         return TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG, lift=still)
 
-    module = "drakegrasp.hand_setup.check"
+    module = "drakegrasp.hand_setup"
     monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)
     monkeypatch.setattr(f"{module}.run_attempt", hold)
     config = load_config(overrides=["lift.drive=torque", "lift.stop_when=lost_sample"])

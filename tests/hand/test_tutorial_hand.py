@@ -11,8 +11,8 @@ from helpers.hands import PAGE as PATH
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 
+from drakegrasp import hand_setup
 from drakegrasp.hand.file_format import Coupling, Finger, HandFile, Palm, Spread
-from drakegrasp.hand_setup import check as trial_grasps
 
 PAGE = PATH.read_text()
 
@@ -38,7 +38,7 @@ def test_the_tutorial_hand_passes_every_check_of_the_page(tongs: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-GRASPS = [f"{shape}, {line}" for shape, line in trial_grasps.GRASPS]
+GRASPS = [f"{shape}, {line}" for shape, line in hand_setup.GRASPS]
 
 
 def test_a_fault_ends_the_command_with_one(tongs: Path) -> None:

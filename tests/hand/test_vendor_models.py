@@ -14,7 +14,7 @@ from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.source import read_model
-from drakegrasp.hand_setup.new import draft_hand
+from drakegrasp.hand_setup import draft_hand
 from drakegrasp.objects.audit import audit
 
 JAW_BOX = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
@@ -254,7 +254,7 @@ def test_a_draft_of_mjcf_is_urdf_that_needs_no_mujoco(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mujoco")
-    monkeypatch.setattr("drakegrasp.hand_setup.new.GRASPS", ())
+    monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
     text = JAWS_MJCF
     for old, new in mesh_tip(f'vertex="{PLATE}"').items():
         text = text.replace(old, new)

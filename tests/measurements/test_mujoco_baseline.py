@@ -27,7 +27,7 @@ import mujoco_scene
 from mujoco_baseline import MujocoBaseline
 from mujoco_scene import build_mujoco_scene
 
-from drakegrasp.mjcf.links import STIFF, TIME_STEP, TORSION_RADIUS, make_spec, pair_friction
+from drakegrasp.mjcf import STIFF, TIME_STEP, TORSION_RADIUS, make_spec, pair_friction
 
 pytestmark = pytest.mark.sim
 

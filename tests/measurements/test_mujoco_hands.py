@@ -14,7 +14,7 @@ from drakegrasp.frames import invert_pose, make_pose  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.hand.kinematics import fingertip_poses, joint_positions  # noqa: E402
 from drakegrasp.hand.settings import load_config  # noqa: E402
-from drakegrasp.hand_setup.check import trial_grasps  # noqa: E402
+from drakegrasp.hand_setup import trial_grasps  # noqa: E402
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

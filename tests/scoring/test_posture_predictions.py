@@ -165,7 +165,9 @@ def test_own_samples_given_back_as_postures_come_out_as_stored(small_dataset, tm
 def test_a_protocol_cuts_an_object_once_for_all_that_is_scored(data, tmp_path, monkeypatch):
     """Postures and contacts are tried apart, and nothing is kept for another call."""
     pytest.importorskip("mujoco")
-    cutting = pytest.importorskip("drakegrasp.mjcf.decomposition")
+    pytest.importorskip("coacd")
+    from drakegrasp import mjcf as cutting
+
     cut, convex_parts = [], cutting.convex_parts
 
     def counted(model):

@@ -1,14 +1,19 @@
-"""Links of a hand as bodies of MuJoCo: inertia, collision shapes and their contacts.
+"""Hands as models of MuJoCo, objects as convex parts. Needs the extra `[peer]`.
 
-Input: a hand that Drake has read. Output: bodies that are added to a specification; or the hand by
-itself as an MJCF whose world is the palm link, for tools that move the root themselves. In this
-MJCF each joint that a motor moves has a position actuator, and coupled joints follow. The root has
-no joint, and the joints of the preshape do not exist.
+Input: a hand that Drake has read. Output: bodies with inertia and collision shapes that are added
+to a specification; or the hand by itself as an MJCF whose world is the palm link, for tools that
+move the root themselves. In this MJCF each joint that a motor moves has a position actuator, and
+coupled joints follow. The root has no joint, and the joints of the preshape do not exist.
+
+MuJoCo collides convex shapes only: `convex_parts` divides an object into such parts.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -28,11 +33,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Joint, RigidBody
 
+from drakegrasp.foreign_files import read_npz
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import SLIDE, Hand
 from drakegrasp.hand.parsing import add_model, joint_axis, joint_slides, moving_joint
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.wavefront import hull_text
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.runtime.files import write_atomic
 
 #: Memory of MuJoCo [bytes]; only what is needed is touched. By default MuJoCo takes about 14 MB,
 #: and leaves contacts out if that is too little, e.g. for a hand deep in an object of many convex
@@ -294,3 +302,63 @@ def write_hand_model(spec: mujoco.MjSpec, path: Path) -> None:
     spec.meshdir = MESHES
     path.write_text(spec.to_xml(), encoding="utf-8")
     spec.meshdir = ""
+
+
+#: Largest concavity of a convex part over the object's size, the seed, and the largest number of
+#: corners of a part.
+SETTINGS = {"threshold": 0.02, "seed": 0, "max_convex_hull": 64}
+
+
+def convex_parts(model: ObjectModel) -> list[Array]:
+    """Return the corners of an object's convex parts, each (n, 3) in {O} [m]."""
+    import coacd
+
+    coacd.set_log_level("error")
+    mesh = coacd.Mesh(model.collision_vertices, model.collision_faces)
+    parts = coacd.run_coacd(mesh, **SETTINGS)
+    return [np.asarray(corners, dtype=float) for corners, _ in parts]
+
+
+def kept_convex_parts(model: ObjectModel, keep: Path) -> list[Array]:
+    """Return the convex parts of an object, cached in a folder, since dividing takes many seconds.
+
+    Args:
+        model: The object.
+        keep: The folder, created with the first object. A file without valid parts is rewritten.
+
+    Raises:
+        OSError: If the folder cannot be written.
+    """
+    path = keep / f"{_digest(model)}.npz"
+    try:
+        return _read_parts(path)
+    except Exception:  # missing, or damaged in any way: it can be computed again
+        parts = convex_parts(model)
+
+    # The parts are read in the order in which they are written.
+    buffer = io.BytesIO()
+    np.savez(buffer, *parts)
+    write_atomic(path, buffer.getvalue())
+    return parts
+
+
+def _read_parts(path: Path) -> list[Array]:
+    """Return the parts in a file.
+
+    Raises:
+        Exception: Of any kind, if the file is missing or holds something else.
+    """
+    content = read_npz(path)
+    parts = [content[f"arr_{k}"] for k in range(len(content))]
+    if not parts:
+        raise ValueError(f"{path}: must hold the corners of convex parts, got none")
+    return parts
+
+
+def _digest(model: ObjectModel) -> str:
+    """Return 32 hex digits that identify everything that determines an object's parts."""
+    digest = hashlib.sha256(repr((SETTINGS, metadata.version("coacd"))).encode())
+    for array in (model.collision_vertices, model.collision_faces):
+        digest.update(repr((array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:32]

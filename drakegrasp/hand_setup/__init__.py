@@ -1,1 +1,0 @@
-"""Hand setup: drafts of hands, and checks before use: files, motion, grasps of simple objects."""

@@ -1,1 +1,0 @@
-"""Hands as models of MuJoCo (MJCF), objects as convex parts. Needs the extra `[peer]`."""
