@@ -17,7 +17,6 @@ row-major. Drake's `RigidTransform` is used only where Drake is called.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import StrEnum
 from typing import Any
 
@@ -121,14 +120,18 @@ class Frame(StrEnum):
     PALM = "palm"  # {G}
 
 
-def validate_frame(frame: object, known: Sequence[Frame]) -> None:
-    """Reject anything but the name of one of these frames.
+#: The frames in which grasps are given; those of a file of grasps, too.
+GRASP_FRAMES = (Frame.OBJECT, Frame.TABLE, Frame.CAMERA, Frame.WORLD, Frame.MESH)
+
+
+def validate_frame(frame: object) -> None:
+    """Reject anything but the name of one of `GRASP_FRAMES`.
 
     Raises:
         GraspError: If it is none of them.
     """
-    if frame not in known:
-        raise GraspError(f"frame must be one of {', '.join(known)}, got {frame!r}")
+    if frame not in GRASP_FRAMES:
+        raise GraspError(f"frame must be one of {', '.join(GRASP_FRAMES)}, got {frame!r}")
 
 
 def frame_in_object(

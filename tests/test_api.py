@@ -39,9 +39,9 @@ from drakegrasp.simulation.placement import PlacedObject, place_object
 from drakegrasp.verification.hints import find_hints
 from drakegrasp.verification.placing import (
     PlacedGrasp,
-    contacts_on_object,
-    contacts_on_rows,
     dataset_config,
+    place_on_object,
+    place_on_rows,
 )
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import write_results
@@ -62,7 +62,7 @@ def cube() -> PlacedObject:
 
 
 def place(grasps: np.ndarray, cube: PlacedObject) -> list[PlacedGrasp]:
-    return contacts_on_object(grasps, cube)
+    return place_on_object(grasps, cube)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
     rows += rows
     names = test_split.column("object_props/object_name")[rows]
     config, grasps = dataset_config(test_split), test_split.column("grasps")[rows]
-    placed = contacts_on_rows(grasps, test_split, rows, config=config)
+    placed = place_on_rows(grasps, test_split, rows, config=config)
     assert sorted(grasp.index for grasp in placed) == list(range(len(rows)))
     of_objects = [grasp.placed.model.name for grasp in placed]
     assert of_objects == names[[grasp.index for grasp in placed]].tolist()
@@ -191,7 +191,7 @@ def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
 
     def hints(grasps: np.ndarray, frame: str) -> set[str]:
         config = dataset_config(test_split)
-        placed = contacts_on_rows(grasps, test_split, rows, config=config, frame=frame)
+        placed = place_on_rows(grasps, test_split, rows, config=config, frame=frame)
         return {
             hint
             for grasp in placed
@@ -253,7 +253,7 @@ def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, wor
         ({"on": "cup.obj"}, r"rows must be given with a GraspDataset only, got \[0\]"),
         ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
         ({"config": {}}, "config must be a Config, see load_config, got a dict"),
-        ({"frame": "palm"}, "frame must be one of object, camera, table, mesh, got 'palm'"),
+        ({"frame": "palm"}, "frame must be one of object, table, camera, world, mesh, got 'palm'"),
         ({"rows": []}, r"rows must be one per grasp \(1\), got 0"),
         # Its objects are prepared: what the configuration says of them could not be kept.
         (
@@ -353,7 +353,7 @@ def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
     assert placed.config == place_object(placed).config == heavy
     # Friction and hand are no matter of the object, its mass is.
     slick = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.1"])
-    (grasp,) = contacts_on_object(GRASP.ravel(), place_object(placed, config=slick))
+    (grasp,) = place_on_object(GRASP.ravel(), place_object(placed, config=slick))
     assert grasp.config == slick
     assert place_object(placed, hand="franka").config.hand == "franka"
     with pytest.raises(ConfigError, match="objects must be as the object was placed with"):

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 import numpy.typing as npt
 
-from drakegrasp.api.protocols import verify_by_protocol
-from drakegrasp.api.verifying import run_verification
+from drakegrasp.api.verifying import run_verification, verify_by_protocol
 from drakegrasp.cluster.connect import Workers
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
@@ -23,8 +22,7 @@ from drakegrasp.scoring.run import Method, Score
 from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import GraspRows
-from drakegrasp.verification.placing import dataset_config, overridden_keys
-from drakegrasp.verification.postures import place_on_rows
+from drakegrasp.verification.placing import dataset_config, overridden_keys, place_on_rows
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -1,14 +1,15 @@
-"""Verifying grasps, on Dask workers or in this process.
+"""Verifying grasps: by a lift, on Dask workers or in this process; by a protocol, in MuJoCo.
 
 `verify_grasp` and `verify_grasps` verify grasps on everything that a grasp can be on: a mesh, a
-placed object, a sample, or a dataset.
+placed object, a sample, or a dataset. Protocols run in processes of this machine.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
 import numpy as np
@@ -22,14 +23,23 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange.columns import HDF5_SUFFIXES
-from drakegrasp.runtime.executor import count_workers, run_here
+from drakegrasp.exchange.dexgraspbench import fitted_postures, write_grasps
+from drakegrasp.hand.description import load_hand
+from drakegrasp.protocols.postures import (
+    PostureResult,
+    PostureTrials,
+    prepare_trials,
+    verify_postures,
+)
+from drakegrasp.runtime.environment import require_mujoco
+from drakegrasp.runtime.executor import Executor, count_workers, processes, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.placement import Placed, place_object
 from drakegrasp.verification.placing import (
     PlacedGrasp,
-    contacts_on_object,
-    contacts_on_rows,
     dataset_config,
+    place_on_object,
+    place_on_rows,
 )
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import ResultCallback, ignore_result, verify_batch
@@ -41,6 +51,10 @@ if TYPE_CHECKING:
 ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
 #: Target of a grasp: an object, or a sample or dataset that defines the object of each grasp.
 GraspTarget: TypeAlias = ObjectMesh | Sample | GraspDataset
+
+#: Receives verdicts as they are computed: called with the place of a grasp in the sequence, its
+#: verdict, and what the trials share.
+OnVerdict: TypeAlias = Callable[[int, PostureResult, PostureTrials], None]
 
 #: Up to this many grasps are verified in this process, because starting workers would take longer.
 FEW_GRASPS = 4
@@ -72,8 +86,8 @@ def verify_grasp(
             a tensor of torch.
         on: Target of the grasp, see `verify_grasps`.
         row: The grasp's row, if `on` is a `GraspDataset`.
-        frame: Frame of the grasp: "object", "camera", "table" or "mesh". See `verify_grasps` for
-            details of this and the following arguments.
+        frame: Frame of the grasp: "object", "table", "camera", "world" or "mesh". See
+            `verify_grasps` for details of this and the following arguments.
         X_TC: With frame "camera" on an object: pose (4, 4) of the camera in {T}.
         units: Unit of a mesh: m, cm or mm.
         X_TO: Pose (4, 4) of an object on the table.
@@ -149,8 +163,8 @@ def verify_grasps(
         rows: Only for a `GraspDataset`: row of its split for each grasp; None for all rows, in
             order.
         frame: Frame of the grasps: "object" {O}, whose origin is the centre of the bounding box;
-            "camera" {C}; "table" {T}, at the centre of the table top; or for a mesh also
-            "mesh" {M}, with the axes and origin of the file. None for the default.
+            "camera" {C}; "table" {T}, at the centre of the table top; "world" {W}; or "mesh" {M},
+            with the axes and origin of the mesh file. None for the default.
         X_TC: Only for an object, with frame "camera": pose of the camera in {T}, (4, 4), or one
             per grasp (n, 4, 4). Rows have their own cameras.
         units: Only for a mesh: unit of its lengths, m, cm or mm; metres if None. An `objects.yaml`
@@ -174,28 +188,32 @@ def verify_grasps(
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
-    placed: list[PlacedGrasp]
     if isinstance(on, Sample | GraspDataset):
-        for name, value in {"X_TC": X_TC, "units": units, "X_TO": X_TO}.items():
-            if value is not None:
-                raise GraspError(
-                    f"{name} must be None on a {type(on).__name__}, which defines it, got a value"
-                )
+        _validate_none(on, X_TC=X_TC, units=units, X_TO=X_TO)
         if isinstance(on, Sample) and rows is not None:
             raise GraspError(f"rows must be None on a Sample, which is one row, got {rows!r}")
         data, chosen = (on.dataset, on.row) if isinstance(on, Sample) else (on, rows)
         used = dataset_config(data, config, hand)
         # A given configuration is used as it is; that of a dataset has the rows' draws.
         drawn, frame = config is None, frame or "camera"
-        placed = contacts_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
+        placed = place_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
     else:
         _validate_target(on)
         if rows is not None:
             raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
-        thing = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
-        placed = contacts_on_object(grasps, thing, frame=frame or "object", X_TC=X_TC)
-        used = thing.config
+        target = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
+        used, frame = target.config, frame or "object"
+        placed = place_on_object(grasps, target, frame=frame, X_TC=X_TC)
     return run_verification(placed, used, client=client, show=show, explained=False)
+
+
+def _validate_none(on: Sample | GraspDataset, **given: object) -> None:
+    """Reject arguments whose values a sample or a dataset defines."""
+    for name, value in given.items():
+        if value is not None:
+            raise GraspError(
+                f"{name} must be None on a {type(on).__name__}, which defines it, got a value"
+            )
 
 
 def _validate_target(on: object) -> None:
@@ -256,3 +274,87 @@ def run_verification(
         return verify_batch(
             grasps, DaskExecutor(joint), report, on_result, together=together, explained=explained
         )
+
+
+# Protocols of MuJoCo
+
+
+def verify_by_protocol(
+    grasps: Sequence[PlacedGrasp],
+    config: Config,
+    protocol: str,
+    on_result: OnVerdict,
+    *,
+    keep: Path | None = None,
+    workers: int | None = None,
+    show: bool = True,
+) -> None:
+    """Try the first wrist pose of grasps of one hand, in their order.
+
+    Args:
+        grasps: See `verification.placing`.
+        config: Their configuration, with the hand.
+        protocol: Name of a protocol that runs in MuJoCo, or `FILE.py:NAME`.
+        on_result: Receives the verdicts.
+        keep: Folder of the convex parts of objects, for the next call; None: they are not kept.
+        workers: Number of processes; one per core if None.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        ConfigError: If there is no such protocol, or it does not run in MuJoCo.
+        MachineError: If a package is missing.
+    """
+    require_mujoco("mujoco", "coacd")
+    hand = load_hand(config.hand_source)
+    with TemporaryDirectory() as scratch, processes(workers) as execute:
+        with progress_bar("cut", "objects", show=show) as report:
+            postures, folder = fitted_postures(grasps, execute), Path(scratch)
+            path, files = write_grasps(
+                postures, hand, folder, execute=execute, keep=keep, report=report
+            )
+        _try_all(files, prepare_trials(protocol, path, folder), on_result, execute, show)
+
+
+def verify_files_by_protocol(
+    files: Sequence[Path],
+    protocol: str,
+    on_result: OnVerdict,
+    *,
+    hand: Path,
+    objects: Path,
+    workers: int | None = None,
+    show: bool = True,
+) -> None:
+    """Try the grasps of files of DexGraspBench, in their order; see `verify_by_protocol`.
+
+    Args:
+        files: The files.
+        protocol: See `verify_by_protocol`, like `on_result`, `workers` and `show`.
+        on_result: See `verify_by_protocol`.
+        hand: MJCF of the hand, whose world is the hand's root.
+        objects: Folder to which the object paths in the files are relative.
+        workers: See `verify_by_protocol`.
+        show: See `verify_by_protocol`.
+
+    Raises:
+        ConfigError, MachineError: As `verify_by_protocol`.
+        HandError: If the MJCF cannot be used.
+    """
+    trials = prepare_trials(protocol, hand, objects)
+    with processes(workers) as execute:
+        _try_all(files, trials, on_result, execute, show)
+
+
+def _try_all(
+    files: Sequence[Path | str],
+    trials: PostureTrials,
+    on_result: OnVerdict,
+    execute: Executor,
+    show: bool,
+) -> None:
+    holding = 0
+    with progress_bar("verify", "grasps", show=show) as report:
+        for index, result in enumerate(verify_postures(files, trials, execute)):
+            on_result(index, result, trials)
+            holding += result[0].success
+            report(index + 1, len(files), holding=holding)

@@ -109,6 +109,7 @@ Preset: TypeAlias = Annotated[str, Parameter(metavar="YAML|PRESET")]
 Settings: TypeAlias = Annotated[tuple[str, ...], Parameter(name="--set", metavar="KEY=VALUE")]
 Units: TypeAlias = Literal["m", "cm", "mm"]
 Split: TypeAlias = Literal["train", "valid", "test"]
+GraspFrame: TypeAlias = Literal["object", "table", "camera", "world", "mesh"]
 AsJson: TypeAlias = Annotated[bool, Parameter(name="--json")]
 
 

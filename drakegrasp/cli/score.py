@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -12,6 +12,7 @@ from drakegrasp.cli.arguments import (
     DataFile,
     Existing,
     Folder,
+    GraspFrame,
     Name,
     Positive,
     Settings,
@@ -43,9 +44,7 @@ def score(
     as_json: AsJson = False,
     quiet: bool = False,
     train: Annotated[DataFile | None, Parameter(group=MORE)] = None,
-    frame: Annotated[
-        Literal["object", "camera", "table", "world"] | None, Parameter(group=MORE)
-    ] = None,
+    frame: Annotated[GraspFrame | None, Parameter(group=MORE)] = None,
     link: Annotated[Name | None, Parameter(group=MORE)] = None,
     preshape: Annotated[Name | None, Parameter(group=MORE)] = None,
     protocol: Annotated[str, Parameter(group=MORE, metavar="NAME|FILE.py:NAME")] = "lift",

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -16,6 +16,7 @@ from drakegrasp.cli.arguments import (
     AnyPath,
     AsJson,
     DataFile,
+    GraspFrame,
     Name,
     Preset,
     Settings,
@@ -67,7 +68,7 @@ class Target:
     units: Units | None = None
     dataset: DataFile | None = None
     split: Split | None = None
-    frame: Literal["object", "camera", "table", "mesh"] | None = None
+    frame: GraspFrame | None = None
     hand: Annotated[str | None, Parameter(metavar="NAME|YAML|XML")] = None
     config: Preset | None = None
     overrides: Settings = ()
@@ -210,7 +211,7 @@ def _by_protocol(
     path: Path, target: Target, protocol: str, assets: Path | None, **how: Any
 ) -> None:
     """Print the verdicts of a protocol of MuJoCo, and how many grasps hold."""
-    from drakegrasp.api.protocols import verify_by_protocol, verify_files_by_protocol
+    from drakegrasp.api.verifying import verify_by_protocol, verify_files_by_protocol
     from drakegrasp.protocols.postures import json_line
 
     where, held = f"with protocol {protocol}", list[bool]()
@@ -294,7 +295,7 @@ def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
     from drakegrasp.exchange.attempts import read_predictions
     from drakegrasp.objects.sources import find_mesh
     from drakegrasp.simulation.attempts import Attempts
-    from drakegrasp.verification.postures import place_on_object
+    from drakegrasp.verification.placing import place_on_object
 
     assert target.mesh is not None
     config = dg.load_config(target.config, target.overrides, **given(hand=target.hand))
@@ -335,7 +336,7 @@ def _of_objects(path: Path, target: Target, dataset: Path) -> tuple[list[PlacedG
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.exchange.attempts import read_attempts
     from drakegrasp.hand.settings import override_config
-    from drakegrasp.verification.postures import place_on_dataset
+    from drakegrasp.verification.placing import place_on_dataset
 
     out = dataset.parent if dataset.is_file() else dataset
     config = override_config(read_manifest(out).config, target.overrides)
@@ -351,8 +352,7 @@ def _of_rows(
     """Return the grasps of a file on the objects of rows of a dataset, and the rows."""
     from drakegrasp.dataset.reader import PredictedRows
     from drakegrasp.exchange.attempts import read_predictions
-    from drakegrasp.verification.placing import dataset_config
-    from drakegrasp.verification.postures import place_on_rows
+    from drakegrasp.verification.placing import dataset_config, place_on_rows
     from drakegrasp.verification.prediction import choose_rows
 
     # For grasps from outside, only the objects and cameras of the rows are needed.

@@ -24,7 +24,6 @@ from drakegrasp.errors import NAMED, GraspError, listed
 from drakegrasp.frames import (
     FARTHEST,
     Array,
-    Frame,
     as_numbers,
     frame_in_object,
     make_pose,
@@ -46,8 +45,6 @@ from drakegrasp.simulation.posture import (
 from drakegrasp.simulation.settle import SAME_UP
 from drakegrasp.table import Table
 
-#: Frames of the rows of a table.
-TABLE_FRAMES = (Frame.OBJECT, Frame.TABLE, Frame.CAMERA, Frame.WORLD, Frame.MESH)
 #: Upper bound of the index of a resting pose; no object has so many.
 MOST_POSES = 1e6
 #: Value of `resting` if a row names no resting pose; all resting poses of the object are tried.
@@ -140,7 +137,7 @@ class Attempts(GraspRows):
             from which the open hand closes.
         q_pregrasp, q_squeeze: (n, j), joint positions before and beyond the grasp; a row of NaN is
             not given.
-        frame: One of `TABLE_FRAMES`.
+        frame: One of `frames.GRASP_FRAMES`.
         X_TC: (n, 4, 4), pose of the camera in {T}, for the frame "camera".
         scale: (n,), metres per unit of length of the posture's mesh file; NaN for any scale.
         said: (n,), origin of each row, in words.
@@ -302,7 +299,7 @@ def make_attempts(
         resting: (n,), index of the object's resting pose; if NaN or None, all are tried.
         X_TO: (n, 4, 4), poses of the objects on the table instead of indices; rows of NaN are not
             given.
-        frame: One of `TABLE_FRAMES`.
+        frame: One of `frames.GRASP_FRAMES`.
         X_TC: (n, 4, 4), with the frame "camera".
         scale: (n,), metres per unit of length of the mesh file.
         said: (n,), origin of each row, in words.
@@ -430,7 +427,7 @@ def read_confidence(stated: Any, shape: tuple[int, ...], invalid: Sequence[str] 
 def _validate_table(count: int, frame: str, X_TC: npt.ArrayLike | None) -> None:
     if not count:
         raise GraspError("postures must be at least one row, got none")
-    validate_frame(frame, TABLE_FRAMES)
+    validate_frame(frame)
     if (X_TC is None) == (frame == "camera"):
         raise GraspError("X_TC must be given with the frame camera, and only then")
 

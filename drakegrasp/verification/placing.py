@@ -1,13 +1,13 @@
-"""Grasps in {O} of their objects on the table: contacts on an object, or on rows of a dataset.
+"""Grasps in {O} of their objects on the table: on an object, on rows of a dataset, on its objects.
 
-Input: contacts, with an object or with rows of a dataset. Output: a `PlacedGrasp` for each. Every
-mistake of the caller is found here, before anything is simulated; a bad row is not a mistake of the
-caller. `postures` puts tables of postures on objects.
+Input: contacts or postures, with an object, with rows of a dataset, or with a dataset whose objects
+the postures name. Output: a `PlacedGrasp` for each. Every mistake of the caller is found here,
+before anything is simulated. A bad row is not a mistake of the caller; it keeps the reason.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,19 +34,29 @@ from drakegrasp.frames import (
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import override_config
-from drakegrasp.simulation.attempts import CONDITIONS, GraspRows
-from drakegrasp.simulation.placement import PlacedObject, validate_config, validate_same_objects
-from drakegrasp.simulation.posture import Posture
-from drakegrasp.verification.prediction import (
-    FRAMES,
-    ContactRows,
-    RowChoice,
-    choose_rows,
-    read_grasps,
+from drakegrasp.simulation.attempts import (
+    CONDITIONS,
+    UNTOLD,
+    Attempts,
+    GraspRows,
+    misfits,
+    unknown_objects,
 )
+from drakegrasp.simulation.placement import (
+    PlacedObject,
+    canonical_pose,
+    place_object,
+    validate_config,
+    validate_same_objects,
+)
+from drakegrasp.simulation.posture import Posture
+from drakegrasp.simulation.settle import find_resting_poses
+from drakegrasp.verification.prediction import ContactRows, RowChoice, choose_rows, read_grasps
 
 #: Names of the frames of a dataset's cameras: the data file's own camera, and the other camera.
 CAMERA, OTHER_CAMERA = "the camera's frame (camera)", "the frame of the dataset's other camera"
+#: Poses of an object at rest that differ by less than this are equal; a file has rounding errors.
+SAME_POSE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,31 +111,47 @@ class PlacedGrasp:
         return transform_points(self.X_OA, self.p_AQ), rotate_vectors(self.X_OA, self.nhat_Q_A)
 
 
-def contacts_on_object(
-    grasps: npt.ArrayLike | ContactRows,
+def place_on_object(
+    grasps: npt.ArrayLike | GraspRows,
     placed: PlacedObject,
     *,
     frame: str = "object",
     X_TC: npt.ArrayLike | None = None,
+    overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
-    """Return contacts on one object, in their order; see `drakegrasp.verify_grasps`.
+    """Return grasps on one object, in their order.
+
+    Postures are tried on this object, whatever object name they give. Postures that name no resting
+    pose are tried in all resting poses of a build.
+
+    Args:
+        grasps: Contacts as an array, see `read_grasps`, or a table of contacts or of postures.
+        placed: The object.
+        frame: Frame of contacts; postures have their own.
+        X_TC: With frame "camera": pose of the camera in {T}, (4, 4), or one per grasp (n, 4, 4).
+        overrides: Settings of the caller; they take precedence over the conditions of a posture.
 
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
     """
-    validate_frame(frame, FRAMES)
-    table, config = _read(grasps, placed.config), with_whole_lifts(placed.config)
-    poses = _camera_poses(X_TC, frame, len(table))
-    found = []
-    for i, pose in enumerate(poses):
+    table, config = _read(grasps, frame, placed.config), placed.config
+    if isinstance(table, Attempts):
+        stands = [placed]
+        if config.objects.resting_poses > 1:
+            others = find_resting_poses(placed.model, config)[1:]
+            stands += [replace(placed, X_TO=resting.X_TO) for resting in others]
+        table = replace(table, objects=(placed.model.name,) * len(table))
+        return _on_stands(table, range(len(table)), stands, config, overridden_keys(overrides))
+    config, found = with_whole_lifts(config), list[PlacedGrasp]()
+    for i, X in enumerate(_camera_poses(X_TC, frame, len(table))):
         # A caller who gives the pose of a camera may mean its inverse.
-        others = {} if pose is None else {"the inverse of X_TC": invert_pose(pose)}
-        found.append(_placed_row(table, i, placed, config, frame, pose, others))
+        inverse = {} if X is None else {"the inverse of X_TC": invert_pose(X)}
+        found.append(_placed_contacts(table, i, placed, config, frame, X, inverse))
     return found
 
 
-def contacts_on_rows(
-    grasps: npt.ArrayLike | ContactRows,
+def place_on_rows(
+    grasps: npt.ArrayLike | GraspRows,
     dataset: GraspDataset,
     rows: RowChoice = None,
     *,
@@ -134,28 +160,77 @@ def contacts_on_rows(
     frame: str = "camera",
     overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
-    """Return contacts on the objects of a dataset's rows.
+    """Return grasps on the objects of a dataset's rows.
 
-    Grasps of the same object are adjacent, so that its scene is built once. Arguments and errors
-    are those of `drakegrasp.verify_grasps`; the configuration is of `dataset_config`. One row may
-    be given for all grasps. With `drawn`, each grasp has the friction and mass that were drawn for
-    its row, except for overridden values.
+    Grasps of the same object are adjacent, so that its scene is built once. Postures are tried on
+    the object and in the resting pose of their rows, whatever they state themselves.
+
+    Args:
+        grasps: See `place_on_object`.
+        dataset: The split.
+        rows: Row of each grasp, or one row for all; None for those of the table, else all rows.
+        config: Configuration of `dataset_config`.
+        drawn: Whether each grasp has the friction and mass that were drawn for its row.
+        frame: Frame of contacts.
+        overrides: Settings of the caller; they take precedence over drawn values.
+
+    Raises:
+        GraspError: As `drakegrasp.verify_grasps`, or if postures are in the frames of mesh files.
     """
-    validate_frame(frame, FRAMES)
     # Read all grasps before any object, so that a wrong number is reported at once.
-    table = _read(grasps, config)
+    table = _read(grasps, frame, config)
     chosen = choose_rows(dataset, table.of_row if rows is None else rows, len(table))
-    cameras = cameras_of_rows(dataset, chosen)
-    found = []
-    for i, placed, used in objects_of_rows(dataset, chosen, config, drawn, overrides):
-        each = {name: X_TC[i] for name, X_TC in cameras.items()}
-        found.append(_placed_row(table, i, placed, used, frame, each[CAMERA], each))
+    on_rows = _objects_of_rows(dataset, chosen, config, drawn, overrides)
+    if isinstance(table, Attempts):
+        _validate_no_mesh_frame(table)
+        return [_posture_of_row(table, i, placed, used) for i, placed, used in on_rows]
+    cameras, found = _cameras_of_rows(dataset, chosen), list[PlacedGrasp]()
+    for i, placed, used in on_rows:
+        seen = {name: X_TC[i] for name, X_TC in cameras.items()}
+        found.append(_placed_contacts(table, i, placed, used, frame, seen[CAMERA], seen))
     return found
 
 
-def _read(grasps: npt.ArrayLike | ContactRows, config: Config) -> ContactRows:
-    """Return given contacts, or read contacts of the configuration's hand."""
-    if isinstance(grasps, ContactRows):
+def place_on_dataset(
+    table: Attempts, out: Path, config: Config | None = None, *, overrides: Sequence[str] = ()
+) -> list[PlacedGrasp]:
+    """Return postures on the objects of a dataset that they name.
+
+    Rows of an object in a resting pose are adjacent, so that its scene is built once.
+
+    Args:
+        table: The postures.
+        out: Directory of the dataset.
+        config: Configuration for the trials; None for each object's configuration.
+        overrides: Settings of the caller; they take precedence over the conditions of a row.
+
+    Raises:
+        GraspError: If the postures are in the frames of mesh files.
+        DataError: If the dataset cannot be used.
+    """
+    _validate_no_mesh_frame(table)
+    manifest = read_manifest(out)
+    names = [entry.name for entry in manifest.objects]
+    table, found = table.refuse(unknown_objects(table, names)), list[PlacedGrasp]()
+    for name in dict.fromkeys(table.objects):
+        # An object that does not exist is known by its name alone.
+        there = name if name in names else names[0]
+        stands = _resting_objects(out, there, manifest.config)
+        if name not in names:
+            model = replace(stands[0].model, name=name)
+            stands = [replace(stands[0], model=model, X_TO=np.full((4, 4), np.nan))]
+        rows = [i for i, each in enumerate(table.objects) if each == name]
+        rows.sort(key=table.resting.__getitem__)
+        used = config or stands[0].config
+        found += _on_stands(table, rows, stands, used, overridden_keys(overrides))
+    return found
+
+
+def _read(grasps: npt.ArrayLike | GraspRows, frame: str, config: Config) -> ContactRows | Attempts:
+    """Return a given table, or read contacts of the configuration's hand."""
+    validate_frame(frame)
+    if isinstance(grasps, GraspRows):
+        assert isinstance(grasps, ContactRows | Attempts)
         return grasps
     return read_grasps(grasps, load_hand(config.hand_source).num_fingers)
 
@@ -181,7 +256,7 @@ def _camera_poses(X_TC: npt.ArrayLike | None, frame: str, count: int) -> Sequenc
     return list(np.broadcast_to(poses, (count, 4, 4)))
 
 
-def _placed_row(
+def _placed_contacts(
     table: ContactRows,
     i: int,
     placed: PlacedObject,
@@ -196,7 +271,7 @@ def _placed_row(
         stands=(placed,),
         config=config,
         invalid=table.invalid[i],
-        **stated(table, i),
+        **_stated(table, i),
         p_AQ=table.points[i],
         nhat_Q_A=table.normals[i],
         X_OA=frame_in_object(frame, placed.X_TO, placed.model.X_OM, X_TC),
@@ -205,7 +280,104 @@ def _placed_row(
     )
 
 
-def stated(table: GraspRows, i: int) -> dict[str, Any]:
+def _validate_no_mesh_frame(table: Attempts) -> None:
+    """Reject postures in frames of meshes: a file cannot say which of both meshes it means.
+
+    Meshes of a dataset are exported in {O}.
+    """
+    if table.frame == "mesh":
+        raise GraspError(
+            "frame must not be mesh for postures on a dataset, got mesh: for its exported meshes "
+            "use --frame object, or give the mesh itself (drakegrasp verify FILE --object MESH)"
+        )
+
+
+def _on_stands(
+    table: Attempts,
+    rows: Iterable[int],
+    stands: Sequence[PlacedObject],
+    config: Config,
+    overridden: set[str],
+) -> list[PlacedGrasp]:
+    """Return some rows on one object, given in each of its resting poses.
+
+    A row that gives the pose of the object is tried in that pose, even if no drop ended in it.
+    """
+    anywhere = replace(table, X_TO=np.full_like(table.X_TO, np.nan))
+    model, poses = stands[0].model, np.array([each.X_TO for each in stands])
+    table = table.refuse(misfits(anywhere, model.name, model.scale, poses))
+    given, found = list[PlacedObject](), list[PlacedGrasp]()
+    for i in rows:
+        tried: Sequence[PlacedObject] = stands[:1]
+        if not table.invalid[i]:
+            try:
+                tried = _stands_of(table, i, stands, given)
+            except GraspError as error:
+                table = table.refuse([str(error) if k == i else "" for k in range(len(table))])
+        drawn = [_under(each, config, table.conditions[i], overridden) for each in tried]
+        found.append(_placed_posture(table, i, i, tuple(each for each, _ in drawn), drawn[0][1]))
+    return found
+
+
+def _stands_of(
+    table: Attempts, i: int, stands: Sequence[PlacedObject], given: list[PlacedObject]
+) -> Sequence[PlacedObject]:
+    """Return the object in each pose that a row is tried in.
+
+    Args:
+        table: The postures.
+        i: Index of the row.
+        stands: The object in its resting poses.
+        given: The object in poses that rows gave; a new one is added, and equal ones are shared.
+
+    Raises:
+        GraspError: If the row gives a pose in which the object does not stand on the table.
+    """
+    if np.isnan(table.X_TO[i]).any():
+        named = int(table.resting[i])
+        return stands if named == UNTOLD else [stands[named]]
+    stood = canonical_pose(table.X_TO[i])
+    for each in (*stands, *given):
+        if np.abs(each.X_TO_simulated - stood).max() < SAME_POSE:
+            return [each]
+    given.append(place_object(stands[0], X_TO=table.X_TO[i]))
+    return given[-1:]
+
+
+def _posture_of_row(table: Attempts, i: int, placed: PlacedObject, config: Config) -> PlacedGrasp:
+    """Return a posture on the object of its row, whatever pose of the object it states itself."""
+    row = replace(
+        table.at([i]),
+        objects=(placed.model.name,),
+        resting=np.zeros(1, dtype=np.int64),
+        X_TO=np.full((1, 4, 4), np.nan),
+    )
+    row = row.refuse(misfits(row, placed.model.name, placed.model.scale, placed.X_TO[None]))
+    return _placed_posture(row, 0, i, (placed,), config)
+
+
+def _placed_posture(
+    table: Attempts, i: int, index: int, stands: tuple[PlacedObject, ...], config: Config
+) -> PlacedGrasp:
+    """Return the posture of a row, which is number `index` of the caller's grasps."""
+    hand = load_hand(config.hand_source)
+    nothing = np.full((hand.num_fingers, 3), np.nan)
+    tried = () if table.invalid[i] else stands
+    return PlacedGrasp(
+        index=index,
+        stands=stands,
+        config=config,
+        invalid=table.invalid[i],
+        **_stated(table, i),
+        p_AQ=nothing,
+        nhat_Q_A=nothing,
+        postures=tuple(table.posture(i, each.X_TO, each.model.X_OM) for each in tried),
+        preshapes=table.shapes(i, hand),
+        named=table.names_pose(i),
+    )
+
+
+def _stated(table: GraspRows, i: int) -> dict[str, Any]:
     """Return the confidence of a row and its rank, as arguments of `PlacedGrasp`."""
     if table.confidence is None:
         return {}
@@ -213,7 +385,7 @@ def stated(table: GraspRows, i: int) -> dict[str, Any]:
     return {"confidence": float(table.confidence[i]), "rank": rank}
 
 
-def objects_of_rows(
+def _objects_of_rows(
     dataset: GraspDataset,
     rows: npt.NDArray[np.int64],
     config: Config,
@@ -223,7 +395,7 @@ def objects_of_rows(
     """Yield each index of rows (n,), with the row's object on the table and the configuration.
 
     Indices with the same object and resting pose are adjacent. Arguments are those of
-    `contacts_on_rows`.
+    `place_on_rows`.
     """
     names = dataset.column("object_props/object_name")[rows].tolist()
     resting = dataset.column("grasp_props/resting")[rows].astype(np.int64)
@@ -231,13 +403,13 @@ def objects_of_rows(
     overridden, out = overridden_keys(overrides), dataset.path.parent
     manifest = read_manifest(out)
     for name in dict.fromkeys(names):
-        stands = resting_objects(out, name, manifest.config)
+        stands = _resting_objects(out, name, manifest.config)
         of_object = [i for i, each in enumerate(names) if each == name]
         for i in sorted(of_object, key=resting.__getitem__):
-            yield i, *under(stands[resting[i]], config, known[i], overridden)
+            yield i, *_under(stands[resting[i]], config, known[i], overridden)
 
 
-def resting_objects(out: Path, name: str, config: Config) -> list[PlacedObject]:
+def _resting_objects(out: Path, name: str, config: Config) -> list[PlacedObject]:
     """Return an object of a dataset, with its configuration, in each of its resting poses."""
     prepared = load_prepared(out, name, config)
     return [
@@ -246,7 +418,7 @@ def resting_objects(out: Path, name: str, config: Config) -> list[PlacedObject]:
     ]
 
 
-def under(
+def _under(
     placed: PlacedObject, config: Config, conditions: Array, overridden: set[str]
 ) -> tuple[PlacedObject, Config]:
     """Return the object and the configuration under the `CONDITIONS` (3,) of a row; NaN: not drawn.
@@ -273,7 +445,7 @@ def under(
     return (placed if model is placed.model else replace(placed, model=model)), config
 
 
-def cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
+def _cameras_of_rows(dataset: GraspDataset, rows: npt.NDArray[np.int64]) -> dict[str, Array]:
     """Return the poses X_TC (n, 4, 4) of a dataset's cameras in rows (n,), by their frames.
 
     The first camera is the data file's own. A camera of scenes is the only one.

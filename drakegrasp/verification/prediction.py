@@ -17,14 +17,12 @@ import numpy.typing as npt
 from drakegrasp.config import LARGEST
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import FARTHEST, Array, Frame, as_numbers
+from drakegrasp.frames import FARTHEST, Array, as_numbers
 from drakegrasp.simulation.attempts import GraspRows, read_confidence
 
 #: The row of a split for each of n grasps, or one row for all; None for all rows, in order.
 RowChoice: TypeAlias = Sequence[int] | npt.NDArray[np.int64] | int | None
 
-#: Frames of predicted contacts.
-FRAMES = (Frame.OBJECT, Frame.CAMERA, Frame.TABLE, Frame.MESH)
 #: A normal whose length differs from one by more than this is reported as normalised.
 NORMAL_TOLERANCE = 0.01
 #: Length below which a normal has no direction.

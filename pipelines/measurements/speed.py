@@ -29,7 +29,7 @@ import numpy as np
 from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes import SceneDataset
-from drakegrasp.verification.placing import contacts_on_rows, dataset_config
+from drakegrasp.verification.placing import dataset_config, place_on_rows
 from drakegrasp.verification.verify import verify_placed
 
 #: Maximum number of grasps per object, fraction of them that are moved, and the shift [m].
@@ -61,7 +61,7 @@ def verdicts(out: Path) -> None:
     points += moved * generator.normal(0.0, SIGMA, points.shape)
 
     # The first verdict also includes the time of imports and tables, so it is not measured.
-    placed = contacts_on_rows(grasps, data, rows, config=dataset_config(data))
+    placed = place_on_rows(grasps, data, rows, config=dataset_config(data))
     verify_placed(placed[-1])
     seconds, success = [], 0
     for grasp in placed:

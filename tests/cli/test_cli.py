@@ -32,9 +32,9 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
 from drakegrasp.exchange.export import export_dataset
+from drakegrasp.frames import GRASP_FRAMES
 from drakegrasp.hand.settings import load_config
 from drakegrasp.shapes.catalog import BuiltinObject
-from drakegrasp.verification.prediction import FRAMES
 
 #: Commands that take any setting of a configuration.
 SETTINGS_OF = ("build", "submit", "predict", "verify", "score", "bench-set")
@@ -420,10 +420,11 @@ def save(folder: Path, *grasps: np.ndarray) -> Path:
     return folder / "grasps.npy"
 
 
-def test_choices_of_verify_are_those_of_the_code() -> None:
-    found = {each.name: each.get_choices() for each in arguments_of("verify")}
-    assert found["--split"] == SPLITS
-    assert found["--frame"] == FRAMES
+def test_choices_of_verify_and_score_are_those_of_the_code() -> None:
+    for command in ("verify", "score"):
+        found = {each.name: each.get_choices() for each in arguments_of(command)}
+        assert found["--split"] == SPLITS
+        assert found["--frame"] == GRASP_FRAMES
 
 
 @pytest.mark.sim
@@ -504,7 +505,7 @@ def test_predictions_for_some_rows_of_a_dataset(small_dataset: Path, tmp_path: P
         (pinch(), ["--hand", "octopus"], "octopus"),
         (pinch(), ["--workers", "0"], "workers must be at least 1, got 0"),
         (pinch(), ["--workers", "some"], "must be a whole number, got"),
-        (pinch(), ["--frame", "world"], 'Choose from: "object", "camera", "table", "mesh"'),
+        (pinch(), ["--frame", "palm"], 'Choose from: "object", "table", "camera", "world"'),
         (
             pinch(),
             ["--split", "test"],

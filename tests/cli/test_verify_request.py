@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from helpers.commands import run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
@@ -202,9 +201,3 @@ def test_grasps_of_others_are_tried_on_rows_that_leave_fingers_out(tmp_path: Pat
     assert len(grasps) == len(predicted) > 0
     with pytest.raises(GraspError, match="test must have contacts of all fingers, got "):
         placed(out, split="test")
-
-
-def test_an_unknown_frame_is_refused_with_the_known_ones(tmp_path: Path) -> None:
-    np.save(tmp_path / "g.npy", np.zeros((1, 18)))
-    told = run("verify", tmp_path / "g.npy", "--object", tmp_path / "none.obj", "--frame", "world")
-    assert 'Choose from: "object", "camera", "table", "mesh".' in told.stderr

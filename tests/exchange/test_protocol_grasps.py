@@ -32,7 +32,7 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture, joint_order
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.verification.placing import contacts_on_object
+from drakegrasp.verification.placing import place_on_object
 from drakegrasp.verification.verify import first_fit
 
 HAND = load_hand()
@@ -171,7 +171,7 @@ def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_
     for i, model in enumerate(models):
         asked = numbers + np.r_[np.tile([0.0, 0.0, 0.004 * i], 3), np.zeros(9)]
         asked[0] = np.nan if i == 2 else asked[0]
-        (grasp,) = contacts_on_object(asked, PlacedObject(model=model, X_TO=standing(model)))
+        (grasp,) = place_on_object(asked, PlacedObject(model=model, X_TO=standing(model)))
         placed.append(grasp)
 
     sent: list[int] = []

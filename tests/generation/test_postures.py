@@ -44,7 +44,7 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.simulation.trial import run_attempt
-from drakegrasp.verification.postures import place_on_dataset, place_on_object
+from drakegrasp.verification.placing import place_on_dataset, place_on_object
 
 pytestmark = pytest.mark.sim
 

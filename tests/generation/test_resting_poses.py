@@ -22,7 +22,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.verification.placing import contacts_on_rows, dataset_config
+from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -90,7 +90,7 @@ def test_samples_are_verified_as_they_lay(dataset: Path) -> None:
     """Grasps of all rows, those of other resting poses too, are put on the table as tried."""
     data, rows = GraspDataset(dataset / "grasping_oto.hdf5"), trials(dataset)
     tried, grasps = data.column("trial_id"), data.column("grasps")
-    placed = contacts_on_rows(grasps, data, config=dataset_config(data))
+    placed = place_on_rows(grasps, data, config=dataset_config(data))
     assert sorted(each.index for each in placed) == list(range(len(grasps)))
     assert len(np.unique(rows["resting"][tried])) > 1
     for each in placed:

@@ -18,8 +18,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.scoring.verdict import rank_file
 from drakegrasp.simulation.posture import joint_order
-from drakegrasp.verification.placing import dataset_config
-from drakegrasp.verification.postures import place_on_rows
+from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 HAND = load_hand()
 

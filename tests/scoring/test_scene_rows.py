@@ -21,7 +21,7 @@ from drakegrasp.scoring.benchmark import rows_digest
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.run import own_contacts
 from drakegrasp.simulation.attempts import Attempts
-from drakegrasp.verification.placing import contacts_on_rows, dataset_config
+from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 pytestmark = pytest.mark.sim
 
@@ -47,7 +47,7 @@ def test_a_row_is_a_view_of_a_scene_with_a_sample(path):
 def test_own_grasps_come_back_to_the_contacts_of_their_trials(path):
     rows = open_rows(path, split="test")
     due = Trials(path.parent)[rows.column("trial_id")].columns(("closed_p_OQ", "X_TO"))
-    placed = contacts_on_rows(rows.column("grasps"), rows, config=dataset_config(rows))
+    placed = place_on_rows(rows.column("grasps"), rows, config=dataset_config(rows))
     order = [grasp.index for grasp in placed]
     found = np.array([grasp.in_object_frame()[0] for grasp in placed])
     np.testing.assert_allclose(found, due["closed_p_OQ"][order], atol=1e-6)

@@ -20,7 +20,7 @@ from drakegrasp.foreign_files import read_json
 from drakegrasp.scoring.card import card_text
 from drakegrasp.scoring.run import VERDICTS, own_contacts, score
 from drakegrasp.scoring.verdict import ranked_sets
-from drakegrasp.verification.placing import contacts_on_rows, dataset_config
+from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def test_objects_of_equal_names_and_other_meshes_are_other_objects(data, tmp_pat
 
 
 def test_own_contacts_are_those_that_are_tried(data):
-    placed = contacts_on_rows(data.column("grasps"), data, config=dataset_config(data))
+    placed = place_on_rows(data.column("grasps"), data, config=dataset_config(data))
     for each in placed:
         found = own_contacts(data, [each.index])[0]
         np.testing.assert_allclose(found.reshape(3, 3), each.in_object_frame()[0], atol=1e-6)

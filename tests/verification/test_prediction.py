@@ -11,6 +11,8 @@ from helpers.assertions import refused
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.frames import (
+    GRASP_FRAMES,
+    X_WT,
     invert_pose,
     make_pose,
     pack_pose,
@@ -18,8 +20,8 @@ from drakegrasp.frames import (
 )
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.verification.placing import contacts_on_object
-from drakegrasp.verification.prediction import FRAMES, read_grasps
+from drakegrasp.verification.placing import place_on_object
+from drakegrasp.verification.prediction import read_grasps
 
 
 def one_grasp(seed=0, k=3):
@@ -157,17 +159,18 @@ def test_the_frames_agree(single, cameras):
     grasps = {
         "object": grasps_O,
         "table": np.array([transform_grasp(X_TO, g) for g in grasps_O]),
+        "world": np.array([transform_grasp(X_WT @ X_TO, g) for g in grasps_O]),
         "mesh": np.array([transform_grasp(invert_pose(X_OM), g) for g in grasps_O]),
         "camera": np.array(
             [transform_grasp(invert_pose(C) @ X_TO, g) for C, g in zip(each, grasps_O, strict=True)]
         ),
     }
-    assert set(grasps) == set(FRAMES)
+    assert set(grasps) == set(GRASP_FRAMES)
     placed = placed_at(X_TO, X_OM)
     for frame, values in grasps.items():
         where = {"X_TC": X} if frame == "camera" else {}
         for grasp, due in zip(
-            contacts_on_object(values, placed, frame=frame, **where), grasps_O, strict=True
+            place_on_object(values, placed, frame=frame, **where), grasps_O, strict=True
         ):
             found = pack_grasp(*grasp.in_object_frame())
             np.testing.assert_allclose(found, due, atol=1e-12)
@@ -175,20 +178,20 @@ def test_the_frames_agree(single, cameras):
         np.testing.assert_allclose(X, np.squeeze(X_TC), atol=1e-6)
 
 
-@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("frame", GRASP_FRAMES)
 def test_no_grasps_have_no_contacts_in_any_frame(frame):
     none = np.zeros((0, 18))
     for X_TC in [np.eye(4), np.zeros((0, 4, 4))] if frame == "camera" else [None]:
         placed = placed_at(np.eye(4), np.eye(4))
-        assert contacts_on_object(none, placed, frame=frame, X_TC=X_TC) == []
+        assert place_on_object(none, placed, frame=frame, X_TC=X_TC) == []
 
 
 @pytest.mark.parametrize(
     ("frame", "X", "message"),
     [
-        ("world", None, "frame must be one of object, camera, table, mesh, got 'world'"),
-        ("", None, "frame must be one of object, camera, table, mesh, got ''"),
-        (None, None, "frame must be one of object, camera, table, mesh, got None"),
+        ("palm", None, "frame must be one of object, table, camera, world, mesh, got 'palm'"),
+        ("", None, "frame must be one of object, table, camera, world, mesh, got ''"),
+        (None, None, "frame must be one of object, table, camera, world, mesh, got None"),
         ("camera", None, "X_TC must be the camera's pose in the table-top frame"),
         ("object", np.eye(4), "X_TC must be None if frame is object, got a pose"),
         ("table", np.eye(4), "X_TC must be None if frame is table, got a pose"),
@@ -206,5 +209,5 @@ def test_no_grasps_have_no_contacts_in_any_frame(frame):
 )
 def test_a_frame_out_of_place_is_refused(frame, X, message):
     placed = placed_at(np.eye(4), np.eye(4))
-    text = refused(contacts_on_object, np.ones((2, 18)), placed, frame=frame, X_TC=X)
+    text = refused(place_on_object, np.ones((2, 18)), placed, frame=frame, X_TC=X)
     assert text.startswith(message)

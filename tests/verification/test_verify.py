@@ -23,7 +23,7 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 from drakegrasp.verification import verify as verifying
-from drakegrasp.verification.placing import contacts_on_object
+from drakegrasp.verification.placing import place_on_object
 from drakegrasp.verification.verify import verify_placed
 
 pytestmark = pytest.mark.sim
@@ -54,7 +54,7 @@ def grasp(cube):
 
 def verify(placed, p, n, config=CONFIG):
     placed = placed if placed.config is config else replace(placed, config=config)
-    (grasp,) = contacts_on_object(dg.pack_grasp(p, n), placed)
+    (grasp,) = place_on_object(dg.pack_grasp(p, n), placed)
     return verify_placed(grasp)
 
 
@@ -322,7 +322,7 @@ def test_a_wrist_pose_alone_is_fitted_by_one_thread(cube, grasp, monkeypatch):
         return fit_wrist(*given, **named)
 
     monkeypatch.setattr(verifying, "fit_wrist", fit)
-    (asked,) = contacts_on_object(dg.pack_grasp(*grasp), cube)
+    (asked,) = place_on_object(dg.pack_grasp(*grasp), cube)
     with threadpool_limits(2):
         verifying.first_fit(asked)
     assert threads == {1}
