@@ -189,7 +189,7 @@ def check_hand_file(hand_file: Name, /, *, picture: NewFile | None = None) -> No
 def _draw(hand_file: str | Path, picture: Path) -> None:
     """Draw a hand."""
     from drakegrasp.hand.finger_sweep import across
-    from drakegrasp.pictures.rendered import picture_hand
+    from drakegrasp.pictures.still_scene import picture_hand
 
     loaded = dg.load_hand(hand_file)
     x, y, _ = across(loaded)

@@ -20,7 +20,7 @@ from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.shapes import hull_triangles, link_shapes
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.pictures.still_scene import Poses, StillScene
+from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report
 from drakegrasp.vision.camera import object_colour
 
@@ -62,7 +62,7 @@ def posed_scene(
     body = model.visual.copy()
     body.visual = _paint(body, (*object_colour(model.name), 1.0))
     _add(scene, f"object/{model.name}", body, grasp.X_TO)
-    posed.pose(Poses(X_WG=grasp.X_TG, q=grasp.q))
+    posed.pose(grasp.X_TG, grasp.q)
     for link, mesh in links.items():
         _add(scene, f"hand/{link}", mesh, posed.link_pose(link))
     return scene

@@ -31,17 +31,13 @@ from drakegrasp.errors import DataError, counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.charts import (
-    draw_counts,
-    draw_distributions,
-)
+from drakegrasp.pictures.charts import draw_counts, draw_distributions
 from drakegrasp.pictures.style import (
     INK,
     add_axes,
     draw_colour_bar,
     draw_finger_legend,
     draw_sample,
-    new_page,
     png_bytes,
     read_far,
     svg_bytes,
@@ -94,12 +90,7 @@ class Samples(NamedTuple):
     quantities: dict[str, Array]
 
 
-def write_figures(
-    out: Path,
-    folder: Path,
-    *,
-    progress: Report = silent,
-) -> Written:
+def write_figures(out: Path, folder: Path, *, progress: Report = silent) -> Written:
     """Write the figures of a dataset, each as PNG and SVG, and their numbers.
 
     A figure for which the dataset has no data is left out.
@@ -121,7 +112,6 @@ def write_figures(
         "outcomes": lambda: _outcomes(funnel),
         "distributions": lambda: _distributions(samples, funnel),
     }
-    known = {*drawings}
 
     # A figure is drawn if there are data.
     written, numbers = Written(folder=folder), {}
@@ -137,7 +127,7 @@ def write_figures(
         progress(done, len(drawings))
 
     # Delete figures of an earlier run that this run did not draw.
-    for name in known.difference(written.names):
+    for name in set(drawings).difference(written.names):
         for suffix in (".png", ".svg"):
             (folder / f"{name}{suffix}").unlink(missing_ok=True)
     text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)
@@ -268,7 +258,7 @@ def draw_sheet(
     block = 3 * EDGE + 2 * gap
     width = across * block + (across - 1) * between + 2 * margin
     height = lines * (EDGE + caption) + head + margin + (0.14 if note else 0.0)
-    figure = new_page(width, height)
+    figure = Figure(figsize=(width, height), facecolor="white")
     figure.text(margin / width, 0.09 / height, note, fontsize=7.0, color=INK, va="bottom")
 
     # The samples, all with the same depth scale.
@@ -278,7 +268,7 @@ def draw_sheet(
         left = margin + column * (block + between)
         top = head + line * (EDGE + caption) + caption
         axes = [add_axes(figure, left + k * (EDGE + gap), top, EDGE, EDGE) for k in range(3)]
-        draw_sample(axes, sample, K, near=nearest, far=far, scale=0.75)
+        draw_sample(axes, sample, K, near=nearest, far=far)
         name = str(sample.props["object_name"]).replace("_", " ")
         write_beside(axes[0], 0.0, 1.05, name, 7.0)
         trial = f"trial {sample.trial_id}"
@@ -334,25 +324,21 @@ def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
         names: Name of the object of each sample.
         count: Maximum number of samples to choose.
     """
-    # Turn t holds the t-th sample of every object that has at least t samples.
+    # Turn t has the t-th sample of every object that has at least t samples.
     order = sorted(range(len(names)), key=lambda i: (_natural(names[i]), i))
-    turns: list[list[int]] = []
-    for _, group in groupby(order, key=lambda i: names[i]):
+    turns: dict[int, list[int]] = {}
+    for _, group in groupby(order, key=names.__getitem__):
         for turn, i in enumerate(group):
-            if turn == len(turns):
-                turns.append([])
-            turns[turn].append(i)
+            turns.setdefault(turn, []).append(i)
 
     # Fill the places turn by turn.
     chosen: list[int] = []
-    for turn_indices in turns:
-        room = min(count - len(chosen), len(turn_indices))
-        picks = np.linspace(0, len(turn_indices) - 1, room).round().astype(int)
-        chosen += [turn_indices[k] for k in picks]
-
+    for _, indices in sorted(turns.items()):
+        room = min(count - len(chosen), len(indices))
+        picks = np.linspace(0, len(indices) - 1, room).round().astype(int)
+        chosen += [indices[k] for k in picks]
     # Samples of an object are side by side.
-    place = {i: k for k, i in enumerate(order)}
-    return sorted(chosen, key=place.__getitem__)
+    return sorted(chosen, key=order.index)
 
 
 def _natural(name: str) -> tuple[int, str]:

@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.colors import to_rgb
 from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, MeshcatParams, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
@@ -28,7 +29,7 @@ from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_object_scene, build_scene
-from drakegrasp.simulation.scene import ObjectScene, Scene, reset_attempt, reset_object
+from drakegrasp.simulation.scene import ObjectScene, reset_attempt, reset_object
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 Result = TypeVar("Result")
@@ -83,41 +84,16 @@ def record_attempt(
         hand = load_hand(config.hand_source).at(attempt.preshape)
         scene = build_scene(model, config.physics, hand, meshcat=meshcat)
         # An attempt that fails before it is simulated is shown at its start.
+        X_WO = X_WT @ np.asarray(X_TO, dtype=float)
         q = None if attempt.path is None else attempt.path[0]
-        pose = attempt.X_OG, attempt.spread, attempt.closing
-        show_start(meshcat, scene, X_TO, config, *pose, q=q)
+        spread, closing = attempt.spread, attempt.closing
+        reset_attempt(scene, X_WO, X_WO @ attempt.X_OG, spread=spread, closing=closing, q=q)
+        _aim_camera(meshcat, scene, X_WO, config, side_W=X_WO[:3, :3] @ attempt.X_OG[:3, 3])
         record = run_attempt(scene, X_TO, attempt, config)
-        draw_predicted(meshcat, p_OQ, nhat_Q_O)
+        _draw_predicted(meshcat, p_OQ, nhat_Q_O)
         return record
 
-    return record_html(run, path, caption)
-
-
-def show_start(
-    meshcat: Meshcat,
-    scene: Scene,
-    X_TO: npt.ArrayLike,
-    config: Config,
-    X_OG: Array,
-    spread: float,
-    closing: Array | None,
-    q: Array | None = None,
-) -> None:
-    """Show object and hand at the start, and aim the camera.
-
-    Args:
-        meshcat: Meshcat that shows them.
-        scene: Scene of the object and the hand.
-        X_TO: (4, 4), resting pose of the object in the table-top frame.
-        config: Configuration with the target of the lift.
-        X_OG: (4, 4), pose of the palm.
-        spread: Angle of the spread joints [rad].
-        closing: (k,), closing positions [rad or m]; the open hand if None.
-        q: (j,), positions of all joints, instead of `spread` and `closing`.
-    """
-    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
-    reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing, q=q)
-    _aim_camera(meshcat, scene, X_WO, config, side_W=X_WO[:3, :3] @ X_OG[:3, 3])
+    return _record_html(run, path, caption)
 
 
 def record_object(
@@ -127,17 +103,12 @@ def record_object(
 
     def run(meshcat: Meshcat) -> None:
         scene = build_object_scene(model, config.physics, meshcat=meshcat)
-        show_object(meshcat, scene, X_TO, config)
+        X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+        reset_object(scene, X_WO)
+        scene.simulator.Initialize()
+        _aim_camera(meshcat, scene, X_WO, config, side_W=np.array([1.0, 0.0, 0.0]))
 
-    record_html(run, path, caption)
-
-
-def show_object(meshcat: Meshcat, scene: ObjectScene, X_TO: npt.ArrayLike, config: Config) -> None:
-    """Show only the object at the start, and aim the camera; see `show_start`."""
-    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
-    reset_object(scene, X_WO)
-    scene.simulator.Initialize()
-    _aim_camera(meshcat, scene, X_WO, config, side_W=np.array([1.0, 0.0, 0.0]))
+    _record_html(run, path, caption)
 
 
 def _aim_camera(
@@ -152,7 +123,7 @@ def _aim_camera(
     meshcat.SetCameraPose(middle + DISTANCE * radius * towards, middle)
 
 
-def record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "") -> Result:
+def _record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "") -> Result:
     """Return the result of `run`, and write what it published, unless it raises an error.
 
     Args:
@@ -201,7 +172,7 @@ def _make_meshcat() -> Meshcat:
         logger.setLevel(level)
 
 
-def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None) -> None:
+def _draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None) -> None:
     """Draw a dot for each contact on the object, with an arrow along its normal.
 
     Args:
@@ -211,12 +182,12 @@ def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None)
     """
     if p_OQ is None or nhat_Q_O is None:
         return
-    colour = rgba(PREDICTED)
+    colour = Rgba(*to_rgb(PREDICTED))
     # A posture has no predicted contacts.
     there = np.isfinite(p_OQ).all(axis=1)
     for i, (p, n) in enumerate(zip(p_OQ[there], nhat_Q_O[there], strict=True)):
         path = f"{OBJECT_PATH}/predicted/{i + 1}"
-        meshcat.SetTransform(path, pose_along(p, n))
+        meshcat.SetTransform(path, RigidTransform(RotationMatrix.MakeFromOneVector(n, 2), p))
         meshcat.SetObject(f"{path}/dot", Sphere(DOT), colour)
         meshcat.SetObject(f"{path}/shaft", Cylinder(SHAFT, ARROW - HEAD), colour)
         meshcat.SetTransform(f"{path}/shaft", RigidTransform([0.0, 0.0, (ARROW - HEAD) / 2.0]))
@@ -224,13 +195,3 @@ def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None)
         meshcat.SetObject(f"{path}/head", MeshcatCone(HEAD, HEAD_RADIUS, HEAD_RADIUS), colour)
         tip = RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0.0, 0.0, ARROW])
         meshcat.SetTransform(f"{path}/head", tip)
-
-
-def pose_along(p_OQ: Array, v_O: Array) -> RigidTransform:
-    """Return the pose in {O} of a frame at a point p_OQ (3,) whose z axis is along v_O (3,)."""
-    return RigidTransform(RotationMatrix.MakeFromOneVector(v_O, 2), p_OQ)
-
-
-def rgba(colour: str) -> Rgba:
-    """Return a colour "#rrggbb" as Drake's type."""
-    return Rgba(*(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)))

@@ -28,9 +28,9 @@ from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.vision.camera import project
 
-#: Colours of contacts: predicted, after closing, after the lift, and those of the dataset's own
-#: grasp (Okabe and Ito: safe for the colour-blind).
-PREDICTED, REACHED, LIFTED, TRUE = "#0072B2", "#D55E00", "#009E73", "#009E73"
+#: Colours of contacts: predicted, after closing, and those of the dataset's own grasp (Okabe and
+#: Ito: safe for the colour-blind).
+PREDICTED, REACHED, TRUE = "#0072B2", "#D55E00", "#009E73"
 #: Colours of the fingers in grasp order (Okabe and Ito: safe for the colour-blind).
 FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
 #: Length of the arrows along the normals [m].
@@ -50,9 +50,7 @@ MASK = np.array([[0, 0, 0, 0], [0x7D, 0x88, 0x96, 0xFF]], dtype=np.uint8)
 MIN_RANGE = 0.05
 
 
-def draw_sample(
-    axes: Sequence[Axes], sample: Sample, K: Array, *, near: float, far: float, scale: float = 1.0
-) -> None:
+def draw_sample(axes: Sequence[Axes], sample: Sample, K: Array, *, near: float, far: float) -> None:
     """Draw colour, depth and mask of a sample, each with its contacts.
 
     Args:
@@ -61,7 +59,6 @@ def draw_sample(
         K: (3, 3), camera matrix [px].
         near: Depth of the brightest end of the colour scale [m].
         far: Far plane; pixels beyond it have no depth [m].
-        scale: Size of dots and lines; 1 is suitable for images of about two inches.
     """
     colour, depth, mask = axes
     colour.imshow(np.moveaxis(sample.image[:3], 0, 2), interpolation="nearest")
@@ -69,63 +66,54 @@ def draw_sample(
     depth.imshow(shown, cmap=_depth_colours(), vmin=near, vmax=far, interpolation="nearest")
     mask.imshow(sample.mask, cmap="gray", vmin=-0.25, vmax=1.1, interpolation="nearest")
     for panel in axes:
-        draw_contacts(panel, sample, K, scale=scale)
+        draw_contacts(panel, sample, K)
 
 
-def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -> None:
+def draw_contacts(axes: Axes, sample: Sample, K: Array) -> None:
     """Draw the contacts of a sample over its image: a dot with an arrow per finger.
 
     Args:
         axes: Axes that show the image.
         sample: The sample, with its grasp in {C}.
         K: (3, 3), camera matrix [px].
-        scale: Size of dots and lines.
     """
     # Project the contacts and the tips of their normals.
     p_CQ, nhat_Q_C = unpack_grasp(sample.grasp)
     dots = project(K, p_CQ)
     ends = project(K, p_CQ + ARROW * nhat_Q_C)
-    size = np.array(sample.mask.shape[::-1])
+    height, width = sample.mask.shape
 
-    for i, (dot, end) in enumerate(zip(dots, ends, strict=True)):
-        # A finger that the grasp leaves out has no contact.
-        if not sample.fingers[i]:
-            continue
+    # A finger that the grasp leaves out has no contact.
+    for i in np.flatnonzero(sample.fingers).tolist():
         # A contact is hidden if something nearer is at its pixel.
-        column, row = np.clip(np.rint(dot), 0, size - 1).astype(int)
+        column, row = np.clip(np.rint(dots[i]), 0, (width - 1, height - 1)).astype(int)
         hidden = p_CQ[i, 2] > sample.image[3, row, column] + HIDDEN
-        mark_contact(axes, i, dot, end, hidden=bool(hidden), scale=scale)
+        _draw_contact(axes, i, dots[i], ends[i], hidden=bool(hidden))
 
-    # Contacts outside of the image must not change the range of the axes.
-    frame_image(axes, *sample.mask.shape)
+    # Contacts outside of the image must not change the range of the axes; pixel centres have
+    # integer coordinates.
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    hide_ticks(axes)
 
 
-def mark_contact(
-    axes: Axes, finger: int, dot: Array, end: Array, *, hidden: bool, scale: float = 1.0
-) -> None:
-    """Draw a contact at a pixel (2,), with an arrow along its normal to another pixel.
+def _draw_contact(axes: Axes, finger: int, dot: Array, end: Array, *, hidden: bool) -> None:
+    """Draw a finger's contact at a pixel (2,), with a line to the pixel (2,) of its normal's tip.
 
-    Args:
-        axes: Axes that show the image.
-        finger: Index of the finger.
-        dot: Start of the arrow (2,) [px].
-        end: End of the arrow (2,) [px].
-        hidden: Whether the camera does not see the contact; then the dot is hollow.
-        scale: Size of dot and line.
+    The dot of a hidden contact is hollow.
     """
-    # The arrow, then the dot over its tail.
+    # The line, then the dot over its start.
     colour = FINGER_COLOURS[finger % len(FINGER_COLOURS)]
-    white = [withStroke(linewidth=3.0 * scale, foreground="white")]
     axes.plot(
-        *np.column_stack([dot, end]), color=colour, linewidth=1.6 * scale,
-        solid_capstyle="round", path_effects=white, zorder=3,
+        *np.column_stack([dot, end]), color=colour, linewidth=1.2, solid_capstyle="round",
+        path_effects=[withStroke(linewidth=2.25, foreground="white")], zorder=3,
     )  # fmt: skip
     axes.plot(
-        *dot, marker="o", markersize=5.2 * scale, markeredgewidth=1.0 * scale,
+        *dot, marker="o", markersize=3.9, markeredgewidth=0.75,
         markerfacecolor="white" if hidden else colour,
         markeredgecolor=colour if hidden else "white",
         linestyle="none", zorder=4, gid=f"contact {finger}",
-        path_effects=[withStroke(linewidth=1.6 * scale, foreground="white")] if hidden else [],
+        path_effects=[withStroke(linewidth=1.2, foreground="white")] if hidden else [],
     )  # fmt: skip
 
 
@@ -171,23 +159,11 @@ def draw_finger_legend(
         for i, c in enumerate(islice(cycle(FINGER_COLOURS), fingers))
     ]
     marks.append(mark(INK, "white", INK, "hidden by the object"))
-    draw_legend(figure, marks, corner, size)
-
-
-def draw_legend(
-    figure: Figure, marks: Sequence[Line2D], corner: tuple[float, float], size: float
-) -> None:
-    """Draw a legend in one line, from its upper left corner, with text of a size [points]."""
     figure.legend(
-        handles=list(marks), loc="upper left", bbox_to_anchor=corner, ncols=len(marks),
+        handles=marks, loc="upper left", bbox_to_anchor=corner, ncols=len(marks),
         fontsize=size, frameon=False, handletextpad=0.1, columnspacing=1.2, borderaxespad=0.0,
         borderpad=0.0, labelcolor=INK,
     )  # fmt: skip
-
-
-def new_page(width: float, height: float) -> Figure:
-    """Return an empty white page of a size [inch]."""
-    return Figure(figsize=(width, height), facecolor="white")
 
 
 def write_beside(axes: Axes, x: float, y: float, text: str, size: float, **more: Any) -> None:
@@ -209,13 +185,6 @@ def hide_ticks(axes: Axes) -> None:
     axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set_visible(False)
-
-
-def frame_image(axes: Axes, height: int, width: int) -> None:
-    """Show only an image's pixels; pixel centres have integer coordinates."""
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    hide_ticks(axes)
 
 
 def shortened(name: str, most: int) -> str:

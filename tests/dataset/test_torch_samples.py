@@ -127,11 +127,10 @@ def test_a_process_that_has_rendered_can_train() -> None:
     code = """
 import numpy as np, torch
 from drakegrasp.hand.description import load_hand
-from drakegrasp.pictures.rendered import LIGHTING
 from drakegrasp.pictures.still_scene import StillScene, camera_pose
 
 scene = StillScene(load_hand())
-scene.picture(camera_pose(0.1 * np.eye(3), 0.3, 0.4), (60, 60), LIGHTING)
+scene.picture(camera_pose(0.1 * np.eye(3), 0.3, 0.4), 60)
 torch.optim.Adam(torch.nn.Linear(2, 1).parameters())
 """
     # In a process of its own, because the fault would be a segmentation fault.

@@ -15,7 +15,7 @@ mujoco = pytest.importorskip("mujoco")
 from drakegrasp.exchange.export import ClosedGrasp  # noqa: E402
 from drakegrasp.frames import invert_pose  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
-from drakegrasp.pictures.still_scene import Poses, StillScene  # noqa: E402
+from drakegrasp.pictures.still_scene import StillScene  # noqa: E402
 
 
 def test_each_scene_has_object_and_links_where_they_were(
@@ -35,7 +35,7 @@ def test_each_scene_has_object_and_links_where_they_were(
         mujoco.mj_kinematics(model, data)
 
         np.testing.assert_allclose(data.body("object").xpos, grasp.X_TO[:3, 3], atol=1e-6)
-        posed.pose(Poses(X_WG=grasp.X_TG, q=grasp.q))
+        posed.pose(grasp.X_TG, grasp.q)
         X_TP = posed.link_pose(hand.palm_link)
         np.testing.assert_allclose(X_TP, grasp.X_TG @ invert_pose(hand.X_BG), atol=1e-9)
         for link in hand.link_chains:

@@ -16,7 +16,7 @@ from drakegrasp.exchange.glb import X_UT, link_meshes, posed_scene
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import load_object
-from drakegrasp.pictures.still_scene import Poses, StillScene
+from drakegrasp.pictures.still_scene import StillScene
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> N
             for name in scene.graph.nodes_geometry
         }
         assert poses.pop(f"object/{grasp.object_name}") == pytest.approx(grasp.X_TO, abs=1e-6)
-        posed.pose(Poses(X_WG=grasp.X_TG, q=grasp.q))
+        posed.pose(grasp.X_TG, grasp.q)
         nodes = {f"hand/{link}": posed.link_pose(link) for link in posed.links}
         assert {f"hand/{name}" for name in hand.fingertip_links} <= set(poses) <= set(nodes)
         for name, X_TL in poses.items():

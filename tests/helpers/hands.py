@@ -14,7 +14,7 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.folder import hand_folder
-from drakegrasp.pictures.still_scene import Poses, StillScene
+from drakegrasp.pictures.still_scene import StillScene
 
 #: A gripper whose two fingers face each other along y, hinged at y = -+0.04, length 0.1.
 PINCER_SDF = """<sdf version="1.9"><model name="pincer">
@@ -148,7 +148,7 @@ def slider_fingers(force: float, **driven_by: object) -> list[object]:
 def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
     """Return the poses X_GFi (k, 4, 4) of the fingertips as Drake computes them."""
     scene = StillScene(hand)
-    scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(spread, closing)))
+    scene.pose(np.eye(4), scene.positions(spread, closing))
     return np.array([scene.link_pose(link) for link in hand.fingertip_links])
 
 

@@ -13,10 +13,9 @@ from pydrake.geometry import Cylinder, Role
 
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.pictures import figures, rendered
+from drakegrasp.pictures import figures, still_scene
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
-from drakegrasp.pictures.rendered import picture_hand
-from drakegrasp.pictures.still_scene import StillScene, camera_pose
+from drakegrasp.pictures.still_scene import StillScene, camera_pose, picture_hand
 
 
 @pytest.fixture
@@ -60,9 +59,11 @@ def test_hand_with_its_pads_and_frames(
     """The palm's axes and those of other tools, pads, and three panels from one camera."""
     lines: list[str] = []
 
-    def picture(scene: StillScene, X_WC: Array, size: tuple[int, int], *_: object) -> np.ndarray:
+    def picture(scene: StillScene, X_WC: Array, edge: int) -> np.ndarray:
         lines.extend([] if lines else shapes_of(scene))
-        lines.append(f"panel {size} {points(X_WC)} {points(scene.link_pose(scene.links[-1]))}")
+        lines.append(
+            f"panel {edge, edge} {points(X_WC)} {points(scene.link_pose(scene.links[-1]))}"
+        )
         return np.zeros((2, 2, 3), np.uint8)
 
     monkeypatch.setattr(StillScene, "picture", picture)
@@ -70,7 +71,7 @@ def test_hand_with_its_pads_and_frames(
     def save(figure: Figure, *_: object, **__: object) -> None:
         lines.append(drawn(figure))
 
-    monkeypatch.setattr(rendered, "save_figure", save)
+    monkeypatch.setattr(still_scene, "save_figure", save)
     picture_hand(load_hand("franka"), tmp_path / "hand.png", across=np.deg2rad(30.0))
     golden("figures/hand", "\n".join(lines))
 
@@ -89,7 +90,7 @@ def test_camera_of_a_still_scene() -> None:
 
 def test_pads_are_drawn_on_both_sides_and_face_out() -> None:
     pad = np.array([[[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0]]])
-    vertices, faces = rendered._lifted(pad)
+    vertices, faces = still_scene._lifted(pad)
     np.testing.assert_allclose(vertices[:, 2], [4e-4] * 3 + [-4e-4] * 3)
     sides = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
     np.testing.assert_allclose(sides, [[0.0, 0.0, 4.0], [0.0, 0.0, -4.0]], atol=1e-12)

@@ -9,16 +9,14 @@ from xml.etree import ElementTree
 
 import h5py
 import matplotlib as mpl
-import numpy as np
 import pytest
 from helpers import datasets
-from helpers.datasets import OTO, SLIP, TRIALS, edit_file, make_dataset
+from helpers.datasets import OTO, TRIALS, edit_file, make_dataset
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.figures import NUMBERS_FILE, read_samples, write_figures
+from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 
 ALL = {"sheet", "outcomes", "distributions"}
 
@@ -102,18 +100,3 @@ def test_names_are_drawn_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert set(written.names) == ALL
     for svg in (tmp_path / "figures").glob("*.svg"):
         assert b"<script" not in svg.read_bytes()
-
-
-def test_every_sample_is_read_once(sound: Path) -> None:
-    held = read_samples(sound)
-    assert held.trial_ids.tolist() == [0, 3, 11, 12, 15, 23, 24, 27, 35]
-    assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
-    np.testing.assert_allclose(held.quantities["slip in the hand [mm]"], 1e3 * SLIP)
-    np.testing.assert_allclose(held.quantities["turn in the hand [°]"], 1.0)
-    np.testing.assert_allclose(held.quantities["largest fingertip force after the lift [N]"], 12.5)
-    np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.125)
-
-
-def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials"):
-        read_samples(tmp_path)

@@ -11,14 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import h5py
 import msgpack
 import numpy as np
 import pytest
 from helpers.objects import CUBE, from_above, standing
 
 from drakegrasp.config import Config
-from drakegrasp.generation.replay import record_trial
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -154,23 +152,3 @@ def test_only_this_machine_is_served_and_only_meanwhile(
         with pytest.raises(ConnectionRefusedError):
             socket.create_connection(("127.0.0.1", url.port), timeout=5.0).close()
     assert "listening" not in "".join(capfd.readouterr())
-
-
-def test_file_that_cannot_be_written_leaves_nothing_behind(
-    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
-) -> None:
-    (tmp_path / "folder").mkdir()
-    missed = replace(attempt, ray_hits=False)
-    with pytest.raises(OSError, match="folder"):
-        record_attempt(cube, standing(cube), missed, config, tmp_path / "folder")
-    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
-
-
-@pytest.mark.slow
-def test_trial_of_a_dataset_is_recorded(small_dataset: Path, tmp_path: Path) -> None:
-    with h5py.File(small_dataset / "trials.hdf5") as file:
-        outcomes = file["trials/outcome"][:]
-    row = int(np.flatnonzero(outcomes == Outcome.MISSING_FINGERTIP)[0])
-    path = tmp_path / "trial.html"
-    assert record_trial(small_dataset, row, path) is Outcome.MISSING_FINGERTIP
-    assert b"finger" in keys_of(path)

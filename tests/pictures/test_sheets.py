@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -143,22 +142,6 @@ def test_examples_of_the_docs_run(
     np.testing.assert_allclose(space["p_LQ"], P_CQ * [1.0, -1.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(space["X_TL"][:3, 2], [0.0, 0.0, 1.0], atol=1e-6)
     assert f"f = {K[0, 0]:.2f} px, c = {K[0, 2]:.1f} px" in text
-
-
-def test_figures_import_no_drake() -> None:
-    import subprocess
-
-    code = (
-        "import sys, drakegrasp.pictures.figures; "
-        "print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
-    )
-    found = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert found.stdout.strip() == "set()"
 
 
 def test_a_finger_that_a_grasp_leaves_out_is_not_drawn() -> None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.pages import surface_of
 
-from drakegrasp.errors import MachineError
-from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.pictures.rendered import picture_hand
-from drakegrasp.pictures.still_scene import Poses, StillScene, link_surfaces
+from drakegrasp.pictures.still_scene import StillScene, link_surfaces
 
 HAND = load_hand()
 
@@ -27,7 +23,7 @@ def scene() -> StillScene:
 def test_fingertips_are_where_the_kinematics_put_them(scene: StillScene) -> None:
     X_WG = make_pose(rotation_about([0.6, 0.0, 0.8], 1.1), [0.1, -0.2, 0.3])
     spread, closing = 0.3, np.array([0.4, 0.9, 1.3])
-    scene.pose(Poses(X_WG=X_WG, q=scene.positions(spread, closing)))
+    scene.pose(X_WG, scene.positions(spread, closing))
     expected = fingertip_poses(HAND, spread=spread, closing=closing)
     for finger, X_GF in zip(HAND.fingers, expected, strict=True):
         np.testing.assert_allclose(scene.link_pose(finger.fingertip), X_WG @ X_GF, atol=1e-9)
@@ -44,20 +40,3 @@ def test_each_link_fills_its_collision_shapes(scene: StillScene) -> None:
         box = np.array([corners.min(axis=0), corners.max(axis=0)])
         # The corners of a cylinder enclose its circle.
         np.testing.assert_allclose(surface_of(content).bounds, box, atol=1.5e-3)
-
-
-def test_a_hand_is_seen_from_beside_and_above(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """25 degrees beside the line along which it closes, 20 degrees above the palm's plane."""
-    seen: list[Array] = []
-
-    def picture(scene: StillScene, X_WC: Array, *_: object) -> None:
-        seen.append(-X_WC[:3, 2])
-        raise MachineError("no OpenGL")
-
-    monkeypatch.setattr(StillScene, "picture", picture)
-    with pytest.raises(MachineError, match="no OpenGL"):
-        picture_hand(load_hand(), tmp_path / "hand.png", across=np.deg2rad(30.0))
-    x, y, z = seen[0]
-    np.testing.assert_allclose(np.rad2deg([np.arctan2(y, x), np.arcsin(z)]), [55.0, 20.0])
