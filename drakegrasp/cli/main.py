@@ -27,7 +27,7 @@ COMMANDS = {
     "scenes": ("datasets:scenes", "Render views of training scenes, independent of grasps."),
     "check": ("datasets:check", "Check every invariant of a dataset."),
     "stats": ("datasets:stats", "Count outcomes, how well grasps hold, and samples."),
-    "inspect": ("views:inspect", "Look at grasps in a browser, and reject them."),
+    "inspect": ("views:inspect", "Render at grasps in a browser, and reject them."),
     "figures": ("views:figures", "Draw a dataset: pictures as PNG and SVG, numbers as JSON."),
     "replay": ("datasets:replay", "Run a trial again and compare every value."),
     "predict": ("predict:predict", "Write grasps for what a camera saw, best first."),

@@ -155,7 +155,7 @@ def new_hand(
     if drafted.findings[0].ok:
         _draw(drafted.path, picture)
         say(
-            f"Look at {picture}: pads must face each other, and Gz (blue) must point out of the "
+            f"Render at {picture}: pads must face each other, and Gz (blue) must point out of the "
             "palm."
         )
     say(f"Then: drakegrasp hand check {drafted.path}")

@@ -26,7 +26,7 @@ def inspect(
     port: Annotated[Count, Parameter(validator=Number(gte=0, lte=65535))] = PORT,
     no_browser: bool = False,
 ) -> None:
-    """Look at grasps in a browser, and reject them.
+    """Render at grasps in a browser, and reject them.
 
     The page shows every attempt in OUT with images, contacts, forces and a 3D view, the most
     anomalous first. Rejections are written to OUT/reject.json immediately; assemble --reject reads

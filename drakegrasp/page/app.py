@@ -24,12 +24,12 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, SCENES_FILE
 from drakegrasp.dataset.rejections import (
@@ -43,11 +43,11 @@ from drakegrasp.dataset.trials import stamp
 from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.page.attempts import Attempts
-from drakegrasp.page.catalog import read_snapshot
 from drakegrasp.page.gallery import Gallery, render
-from drakegrasp.page.looks import HandView, object_surface, read_look
 from drakegrasp.page.predictions import Predictions, result_file
+from drakegrasp.page.renders import HandView, object_surface, read_render
 from drakegrasp.page.scenes import Scenes
+from drakegrasp.page.snapshot import read_snapshot
 from drakegrasp.pictures.style import colour_png, strip_png
 
 ASSETS = Path(__file__).parent / "static"
@@ -206,7 +206,7 @@ class Inspection:
     def warm_up(self) -> None:
         """Load everything that the first page would have to wait for."""
         # The hand loads Drake, the first picture Matplotlib, and the first page its templates.
-        _ = self.hand.links
+        _ = self.hand.surfaces
         image, mask = np.zeros((4, 2, 2), np.float32), np.zeros((2, 2), np.uint8)
         strip_png(image, mask, far=1.0)
         _gallery(Attempts, self, "", {})
@@ -242,8 +242,8 @@ def _strip(inspection: Inspection, name: str, params: Params) -> Response:
     snapshot = inspection.snapshot
     number, _, camera = name.rpartition("-")
     i = inspection.table(Attempts).find(number)
-    look = _there(None if i is None else read_look(snapshot, i, camera), "image")
-    png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
+    found = _there(None if i is None else read_render(snapshot, i, camera), "image")
+    png = strip_png(found.image, found.mask, far=snapshot.config.camera.far)
     return Response(png, media_type="image/png")
 
 
@@ -252,7 +252,7 @@ def _mesh(inspection: Inspection, name: str, params: Params) -> Response:
     kind, _, which = name.partition("-")
     try:
         if kind == "link":
-            content = inspection.hand.surface(int(which))
+            content = inspection.hand.surfaces[int(which)]
         elif kind == "object":
             content = object_surface(inspection.snapshot, int(which))
     except (IndexError, ValueError, FileNotFoundError):
@@ -343,7 +343,7 @@ def make_app(inspection: Inspection) -> Starlette:
             Mount("/static", StaticFiles(directory=ASSETS)),
         ],
         middleware=[
-            Middleware(SecurityHeaders),
+            Middleware(BaseHTTPMiddleware, dispatch=_secured),
             Middleware(TrustedHostMiddleware, allowed_hosts=list(HOSTS), www_redirect=False),
         ],
         exception_handlers=dict.fromkeys((HTTPException, DrakegraspError, OSError), _error),
@@ -352,23 +352,12 @@ def make_app(inspection: Inspection) -> Starlette:
     return app
 
 
-class SecurityHeaders:
-    """Adds the HEADERS to every answer that lacks them."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-
-        async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                there = {name.lower() for name, _ in message["headers"]}
-                new = [(k.encode(), v.encode()) for k, v in HEADERS.items()]
-                message["headers"] = [*message["headers"], *(h for h in new if h[0] not in there)]
-            await send(message)
-
-        await self._app(scope, receive, send_with_headers)
+async def _secured(request: Request, call_next: RequestResponseEndpoint) -> Response:
+    """Return the answer to a request, with the HEADERS that it lacks."""
+    answer = await call_next(request)
+    for name, value in HEADERS.items():
+        answer.headers.setdefault(name, value)
+    return answer
 
 
 async def _content(request: Request, token: str) -> dict[str, Any]:

@@ -17,16 +17,16 @@ from drakegrasp.dataset.successes import own_setting
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
-from drakegrasp.page.looks import (
+from drakegrasp.page.renders import (
     THUMBNAIL,
     HandView,
     attempt_scene,
     contact_dots,
-    read_look,
+    read_render,
     read_rows,
 )
+from drakegrasp.page.snapshot import Snapshot
 from drakegrasp.simulation.attempt import Source
 
 #: Features of an attempt for sorting, with their display.
@@ -114,16 +114,11 @@ class Attempts(Gallery):
 
         The command names user-defined filters again, since a dataset stores only their names.
         """
-        snapshot = self.snapshot
-        out = snapshot.out
+        out = self.snapshot.out
         words = ["drakegrasp", "assemble", str(out), "--reject", str(out / FILE_NAME)]
-        if own := own_setting(snapshot.config.filters):
+        if own := own_setting(self.snapshot.config.filters):
             words += ["--set", own]
-        return {
-            "token": self.token,
-            "counts": self.counts(),
-            "assemble": shlex.join(words),
-        }
+        return {"token": self.token, "counts": self.counts(), "assemble": shlex.join(words)}
 
     # Contents of pages.
 
@@ -174,30 +169,19 @@ class Attempts(Gallery):
         outcome = Outcome(int(snapshot.table.outcome[i]))
         views = []
         for camera in CAMERAS if snapshot.table.split[i] != NONE else ():
-            look = read_look(snapshot, i, camera)
-            unread = DATA_FILES[camera] if look is None else ""
+            unread = DATA_FILES[camera] if read_render(snapshot, i, camera) is None else ""
             strip = f"/strip/{i}-{camera}.png"
             dots = contact_dots(snapshot, row, camera)
             views.append({"camera": camera, "strip": strip, "unread": unread, "dots": dots})
 
-        key = snapshot.key(i)
+        again = ("--trial", str(i), "--html", "trial.html")
         return {
-            "replay": shlex.join(
-                [
-                    "drakegrasp",
-                    "replay",
-                    str(snapshot.out),
-                    "--trial",
-                    str(i),
-                    "--html",
-                    "trial.html",
-                ]
-            ),
+            "replay": shlex.join(["drakegrasp", "replay", str(snapshot.out), *again]),
             **self._decisions(),
             "outcome": outcome.label.replace("_", " "),
             "words": words_of(snapshot, i),
             "success": outcome is Outcome.SUCCESS,
-            "decision": self.decisions.of(key),
+            "decision": self.decisions.of(snapshot.key(i)),
             "views": views,
             "score": _text(snapshot, "anomaly", i),
             "parts": [(part.shown.title, _text(snapshot, part.name, i)) for part in PARTS],

@@ -21,8 +21,8 @@ from drakegrasp.dataset.schema import SPLITS, Shown
 from drakegrasp.errors import DataError, counted, printable
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import Snapshot
-from drakegrasp.page.looks import HandView
+from drakegrasp.page.renders import HandView
+from drakegrasp.page.snapshot import Snapshot
 from drakegrasp.pictures.style import FINGER_COLOURS, PREDICTED, REACHED, TRUE
 from drakegrasp.table import AnyArray, Table
 

@@ -29,9 +29,8 @@ from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.attempts import words_of
-from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
-from drakegrasp.page.looks import (
+from drakegrasp.page.renders import (
     THUMBNAIL,
     Dot,
     HandView,
@@ -41,6 +40,7 @@ from drakegrasp.page.looks import (
     make_scene,
     read_rows,
 )
+from drakegrasp.page.snapshot import Snapshot
 from drakegrasp.table import Table
 
 #: Group of the verdicts in a result file, and their fields.

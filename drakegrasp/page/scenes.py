@@ -14,9 +14,9 @@ from drakegrasp.dataset.schema import SPLITS, VIEW_KINDS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import Snapshot
 from drakegrasp.page.gallery import Gallery, Places, Query
-from drakegrasp.page.looks import ARROW, HandView, contacts_in_table, dots_of, make_scene
+from drakegrasp.page.renders import ARROW, HandView, contacts_in_table, dots_of, make_scene
+from drakegrasp.page.snapshot import Snapshot
 from drakegrasp.pictures.style import REACHED, TRUE
 from drakegrasp.table import Table
 
@@ -120,7 +120,7 @@ class Scenes(Gallery):
         return {
             "drawn": None if drawn is None else int(trials[drawn]),
             "views": [self._seen(i, k, drawn) for k in range(len(self.views(i)))],
-            "looks": [HOLDS, FAILS, UNKNOWN],
+            "kinds_of_palms": [HOLDS, FAILS, UNKNOWN],
             "scene": self._scene(i, grasps, hand),
         }
 

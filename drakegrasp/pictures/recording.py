@@ -114,7 +114,7 @@ def record_object(
 def _aim_camera(
     meshcat: Meshcat, scene: ObjectScene, X_WO: Array, config: Config, *, side_W: Array
 ) -> None:
-    """Look from beside the palm, whose direction is `side_W`, so far that the lift is visible."""
+    """Render from beside the palm, whose direction is `side_W`, so far that the lift is visible."""
     way = X_WT[:3, 3] + config.lift.p_TG - X_WO[:3, 3]
     radius = np.linalg.norm(way) / 2.0 + np.linalg.norm(scene.model.half_extents) + HAND_RADIUS
     azimuth = np.arctan2(side_W[1], side_W[0]) + AZIMUTH

@@ -26,7 +26,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import read_snapshot
+from drakegrasp.page.snapshot import read_snapshot
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 
 

@@ -34,7 +34,7 @@ from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.catalog import read_snapshot
+from drakegrasp.page.snapshot import read_snapshot
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.files import seal
 

@@ -17,7 +17,7 @@ from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.page.catalog import read_snapshot
+from drakegrasp.page.snapshot import read_snapshot
 from drakegrasp.runtime.executor import run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]

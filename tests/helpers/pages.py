@@ -14,7 +14,7 @@ import trimesh
 from starlette.testclient import TestClient
 
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.page.catalog import IDENTITY, Snapshot
+from drakegrasp.page.snapshot import IDENTITY, Snapshot
 
 #: A name that must stay text.
 ATTACK = "<script>alert(1)</script>"

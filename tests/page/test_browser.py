@@ -27,7 +27,7 @@ from drakegrasp.dataset.rejections import (
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.page.app import Inspection, listen, make_app
-from drakegrasp.page.catalog import Snapshot, read_snapshot
+from drakegrasp.page.snapshot import Snapshot, read_snapshot
 
 playwright = pytest.importorskip("playwright.sync_api")
 Browser, Page = playwright.Browser, playwright.Page

@@ -14,7 +14,7 @@ from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.page.attempts import Attempts
-from drakegrasp.page.catalog import Snapshot, read_snapshot
+from drakegrasp.page.snapshot import Snapshot, read_snapshot
 
 NOTHING = Decisions()
 

@@ -12,8 +12,8 @@ from helpers.datasets import TRIALS, make_dataset
 from drakegrasp.dataset.quality import GRAVITY
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
-from drakegrasp.page.catalog import read_snapshot
-from drakegrasp.page.looks import THUMBNAIL, contact_dots, read_rows
+from drakegrasp.page.renders import THUMBNAIL, contact_dots, read_rows
+from drakegrasp.page.snapshot import read_snapshot
 from drakegrasp.vision.camera import intrinsics, project
 
 

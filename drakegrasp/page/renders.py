@@ -1,4 +1,4 @@
-"""Contents of pages for single rows: numbers, images with their contacts, and the 3D view.
+"""Renders of single rows: images with their contacts, and the 3D view.
 
 Input: attempts, which are read from the files when requested, and the hand. The 3D view consists of
 plain lists for JSON. Everything in it is in {T}, with the object in its resting pose: lifted hands
@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,11 +24,12 @@ from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
-from drakegrasp.page.catalog import Snapshot, find_model
+from drakegrasp.page.snapshot import Snapshot, find_model
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
 
-#: Maximum number of object meshes in memory.
-KEPT_MESHES = 32
+if TYPE_CHECKING:
+    from drakegrasp.pictures.still_scene import StillScene
+
 #: Columns that the dots on a thumbnail need.
 THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
 #: Length of the arrows along the normals [m].
@@ -37,7 +37,7 @@ ARROW = 0.03
 _CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
 
 
-class Look(NamedTuple):
+class Render(NamedTuple):
     """The images of a success by one camera.
 
     Attributes:
@@ -83,7 +83,7 @@ def read_rows(
     ]
 
 
-def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
+def read_render(snapshot: Snapshot, i: int, camera: str) -> Render | None:
     """Return the images of a sample, or None if they cannot be read.
 
     Args:
@@ -98,7 +98,7 @@ def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     try:
         with open_hdf5(snapshot.out / DATA_FILES[camera]) as file:
             own = file[SPLITS[split[i]]]
-            return Look(image=own["images"][row], mask=own["masks"][row])
+            return Render(image=own["images"][row], mask=own["masks"][row])
     except (OSError, KeyError, ValueError, IndexError):
         return None
 
@@ -156,46 +156,36 @@ def dots_of(
 class HandView:
     """The hand of a dataset for the 3D view; Drake is loaded when the hand is first needed.
 
+    A hand that cannot be loaded here is a `problem`, not an error.
+
     Args:
         config: Configuration of the dataset.
     """
 
     def __init__(self, config: Config) -> None:
-        self._source = config.hand_source
-        self._lock = threading.Lock()
-        self._scene: Any = None
-        self._surfaces: dict[str, bytes] = {}
-        #: Why the hand cannot be shown, in words; empty if it can.
-        self.problem = ""
+        self._source, self._lock = config.hand_source, threading.Lock()
 
-    def load(self) -> None:
-        """Load the hand; a hand that cannot be loaded here is a `problem`, not an error."""
-        with self._lock:
-            if self._scene is not None or self.problem:
-                return
-            from drakegrasp.hand.description import load_hand
-            from drakegrasp.pictures.still_scene import StillScene, link_surfaces
+    @cached_property
+    def _loaded(self) -> tuple[StillScene | None, dict[str, bytes], str]:
+        """The hand, the surfaces of its links, and why it cannot be shown."""
+        from drakegrasp.hand.description import load_hand
+        from drakegrasp.pictures.still_scene import StillScene, link_surfaces
 
-            try:
-                scene = StillScene(load_hand(self._source))
-                self._surfaces, self._scene = link_surfaces(scene), scene
-            except (DrakegraspError, RuntimeError, OSError) as error:
-                self.problem = f"the hand cannot be shown: {str(error).splitlines()[0]}"
+        try:
+            scene = StillScene(load_hand(self._source))
+            return scene, link_surfaces(scene), ""
+        except (DrakegraspError, RuntimeError, OSError) as error:
+            return None, {}, f"the hand cannot be shown: {str(error).splitlines()[0]}"
 
     @property
-    def links(self) -> tuple[str, ...]:
-        """Names of the links with a shape, in the order of their numbers in addresses."""
-        self.load()
-        return tuple(self._surfaces)
+    def problem(self) -> str:
+        """Why the hand cannot be shown, in words; empty if it can."""
+        return self._loaded[2]
 
-    def surface(self, number: int) -> bytes:
-        """Return the shapes of a link as JSON, see `pictures.still_scene`.
-
-        Raises:
-            IndexError: If there is no link with this number.
-        """
-        link = self.links[number]  # first, since it may load them
-        return self._surfaces[link]
+    @property
+    def surfaces(self) -> list[bytes]:
+        """The shapes of each link that has one as JSON, see `pictures.still_scene`."""
+        return list(self._loaded[1].values())
 
     def poses(self, X_TG: Array, q: Array | None, spread: float) -> list[list[float]]:
         """Return the poses of the links, column by column as for three.js; empty without a hand.
@@ -207,18 +197,16 @@ class HandView:
             q: (j,), positions of the joints [rad or m]; None for the open hand.
             spread: Angle of the spread joints of the open hand [rad].
         """
-        self.load()
-        if self._scene is None:
+        scene, surfaces, _ = self._loaded
+        if scene is None:
             return []
-        from drakegrasp.pictures.still_scene import Poses
-
+        rest = scene.positions(spread)
+        positions = rest if q is None else q
+        if len(positions) != len(rest):
+            return []
         with self._lock:
-            rest = self._scene.positions(spread)
-            positions = rest if q is None else q
-            if len(positions) != len(rest):
-                return []
-            self._scene.pose(Poses(X_WG=X_TG, q=positions))
-            return [_columns(self._scene.link_pose(link)) for link in self._surfaces]
+            scene.pose(X_TG, positions)
+            return [_columns(scene.link_pose(link)) for link in surfaces]
 
 
 def attempt_scene(
@@ -278,7 +266,7 @@ def make_scene(
         "objectNumber": number,
         "objectName": snapshot.names[number],
         "hasObject": find_model(snapshot.out, snapshot.names[number]) is not None,
-        "links": len(hand.links),
+        "links": len(hand.surfaces),
         "states": states,
     }
 
@@ -329,14 +317,8 @@ def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
     Raises:
         MeshError: If the file cannot be read.
     """
-    path = find_model(snapshot.out, snapshot.names[number])
-    return None if path is None else _read_surface(path, path.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=KEPT_MESHES)
-def _read_surface(path: Path, modified: int) -> bytes:
-    """Return the surface in an object's file, which is read again if modified later [ns]."""
     from drakegrasp.objects.model import load_object
     from drakegrasp.pictures.still_scene import object_json
 
-    return object_json(load_object(path))
+    path = find_model(snapshot.out, snapshot.names[number])
+    return None if path is None else object_json(load_object(path))

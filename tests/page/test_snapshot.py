@@ -13,8 +13,8 @@ from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.page.attempts import Attempts
-from drakegrasp.page.catalog import FEATURES, read_snapshot
-from drakegrasp.page.looks import read_look, read_rows
+from drakegrasp.page.renders import read_render, read_rows
+from drakegrasp.page.snapshot import FEATURES, read_snapshot
 
 
 def test_table_is_what_the_files_say(boxes: Path) -> None:
@@ -47,11 +47,11 @@ def test_rows_and_images_are_those_of_the_attempt(boxes: Path) -> None:
     assert snapshot.find(AttemptKey("2_box_b", 99, 0)) is None
     (row,) = read_rows(snapshot, [i], ("X_OG",))
     np.testing.assert_array_equal(row["X_OG"], X_OG)
-    look = read_look(snapshot, i, "otm")
-    assert look is not None
-    np.testing.assert_array_equal(look.image, image)
-    np.testing.assert_array_equal(look.mask, mask)
-    assert read_look(snapshot, i + 1, "otm") is None
+    found = read_render(snapshot, i, "otm")
+    assert found is not None
+    np.testing.assert_array_equal(found.image, image)
+    np.testing.assert_array_equal(found.mask, mask)
+    assert read_render(snapshot, i + 1, "otm") is None
 
 
 def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
