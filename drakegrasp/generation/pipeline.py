@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -26,13 +25,12 @@ from drakegrasp.dataset.manifest import (
     release_directory,
     write_manifest,
 )
-from drakegrasp.dataset.prepared_objects import load_prepared, with_drawn
+from drakegrasp.dataset.prepared_objects import with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled, palms_in_files
 from drakegrasp.dataset.survey import Decisions, decide, headers_by_object, known_homes, survey
 from drakegrasp.errors import (
     DataError,
-    DrakegraspError,
     GraspError,
     counted,
     listed,
@@ -45,7 +43,7 @@ from drakegrasp.generation.prepare import (
     DrawTask,
     PrepareTask,
     draw_palms,
-    first_palms,
+    find_entry,
     prepare_one,
 )
 from drakegrasp.generation.target import Target
@@ -297,29 +295,7 @@ class _Build:
         before: dict[str, ObjectEntry | RefusedMesh] = {e.name: e for e in manifest.objects}
         before |= {entry.name: entry for entry in manifest.refused}
 
-        # Reuse the files of unchanged meshes.
-        entries: dict[str, ObjectEntry | RefusedMesh] = {}
-        for source in sources:
-            entry = _known_entry(source, before.get(source.name), self._out, self._config)
-            if entry is not None:
-                entries[source.name] = entry
-        report(len(entries), len(sources))
-
-        # Prepare the others, in any order.
-        tasks = [
-            PrepareTask(
-                source=source,
-                out=self._out,
-                config=self._config,
-                postures=self._postures and self._postures.of_object(source.name),
-                restartable=self._pool is not None,
-            )
-            for source in sources
-            if source.name not in entries
-        ]
-        for name, entry in self._execute(prepare_one, tasks):
-            entries[name] = entry
-            report(len(entries), len(sources))
+        entries = self._entries(sources, before, report)
 
         # If a mesh has changed, its rows and its rejected grasps no longer exist.
         same = {n for n, e in before.items() if entries[n].mesh_sha256 == e.mesh_sha256}
@@ -356,6 +332,41 @@ class _Build:
         )
         known_homes(self._manifest)  # raises an error for a group in two splits
         write_manifest(self._manifest, self._out)
+
+    def _entries(
+        self,
+        sources: Sequence[MeshSource],
+        before: Mapping[str, ObjectEntry | RefusedMesh],
+        report: Report,
+    ) -> dict[str, ObjectEntry | RefusedMesh]:
+        """Return the entry of each mesh; those that were prepared or rejected before are reused."""
+        entries: dict[str, ObjectEntry | RefusedMesh] = {}
+        for source in sources:
+            known = before.get(source.name)
+            if not isinstance(known, RefusedMesh):
+                known = find_entry(source, self._out, self._config)
+            elif known.again or source_sha256(source) != known.mesh_sha256:
+                known = None
+            if known is not None:
+                entries[source.name] = known
+        report(len(entries), len(sources))
+
+        # Prepare the others, in any order.
+        tasks = [
+            PrepareTask(
+                source=source,
+                out=self._out,
+                config=self._config,
+                postures=self._postures and self._postures.of_object(source.name),
+                restartable=self._pool is not None,
+            )
+            for source in sources
+            if source.name not in entries
+        ]
+        for name, entry in self._execute(prepare_one, tasks):
+            entries[name] = entry
+            report(len(entries), len(sources))
+        return entries
 
     # Work units
 
@@ -504,22 +515,3 @@ def _refused(postures: Attempts, manifest: Manifest) -> str:
     if all(postures.invalid):
         raise GraspError(postures.refused)
     return postures.refused
-
-
-def _known_entry(
-    source: MeshSource, before: ObjectEntry | RefusedMesh | None, out: Path, config: Config
-) -> ObjectEntry | RefusedMesh | None:
-    """Return the entry of a mesh as it is now; None if the mesh must be prepared.
-
-    The files of an object decide, since a build that died may not have written its entry.
-    """
-    if isinstance(before, RefusedMesh):
-        same = not before.again and source_sha256(source) == before.mesh_sha256
-        return before if same else None
-    try:
-        prepared = load_prepared(out, source.name, config)
-    except DrakegraspError:
-        return None
-    model = prepared.model
-    same = (model.class_name, model.mesh_sha256) == (source.class_name, source_sha256(source))
-    return prepared.entry() if same and prepared.asked >= first_palms(config) else None

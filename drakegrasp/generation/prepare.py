@@ -17,20 +17,14 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
 from drakegrasp.dataset.paths import model_path, object_files
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
-from drakegrasp.errors import DrakegraspError, MachineError, MeshError
+from drakegrasp.errors import DrakegraspError, MeshError
 from drakegrasp.frames import Array
 from drakegrasp.generation.directory import DatasetTask
 from drakegrasp.objects.model import ObjectModel, prepare_object
-from drakegrasp.objects.sources import MeshSource, read_source
+from drakegrasp.objects.sources import MeshSource, read_source, source_sha256
 from drakegrasp.runtime.environment import one_thread, release_memory
 from drakegrasp.runtime.files import disk_full_named
-from drakegrasp.runtime.journal import (
-    GIVE_UP_DEATHS,
-    PREPARE,
-    Verdict,
-    inject_fault,
-    open_journal,
-)
+from drakegrasp.runtime.journal import PREPARE, Verdict, inject_fault, open_journal
 from drakegrasp.simulation.attempts import Attempts, given_candidates
 from drakegrasp.simulation.candidates import Drawing
 from drakegrasp.simulation.settle import find_resting_poses
@@ -161,42 +155,50 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
     with disk_full_named(out):
         # The worker or the client may have died before the object was in the manifest.
         read = _, digest = read_source(task.source)
-        entry = _entry_there(task, digest)
+        entry = find_entry(task.source, out, config, digest)
         if entry is not None:
             return name, entry
-        if not task.restartable:
-            return name, _prepared_entry(task, read)
 
         # The journal identifies a mesh that kills its process, which is then rejected.
         release_memory()
         config_hash = config.simulation_hash()
         identity = {"name": name, "mesh_sha256": digest, "config_hash": config_hash}
-        with open_journal(task.journal, identity) as journal:
+        with open_journal(task.journal, identity, restartable=task.restartable) as journal:
             verdict = journal.verdict(PREPARE)
             if verdict is not None:
                 # More memory may help, so the next build tries again.
                 again = verdict is Verdict.VANISHED
                 reason = f"preparing it {verdict.value}"
                 return name, RefusedMesh(name=name, mesh_sha256=digest, reason=reason, again=again)
-            if journal.in_crash_loop:
-                raise MachineError(
-                    f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; "
-                    "is there enough memory? The same command continues from here"
-                )
+            journal.validate_no_loop(f"{name}, preparing it")
             with journal.step(PREPARE, PREPARE_SECONDS):
                 inject_fault(name)
                 return name, _prepared_entry(task, read)
 
 
-def _entry_there(task: PrepareTask, digest: str) -> ObjectEntry | None:
-    """Return the entry of an object whose files are complete, or None."""
+def find_entry(
+    source: MeshSource, out: Path, config: Config, digest: str | None = None
+) -> ObjectEntry | None:
+    """Return the entry of a prepared object; None if its mesh must be prepared.
+
+    Its files decide, since a build that died may not have written its entry.
+
+    Args:
+        source: The mesh.
+        out: Directory of the dataset.
+        config: Configuration of the dataset.
+        digest: SHA-256 of the mesh as it is now; None: the file is read if the object is there.
+
+    Raises:
+        MeshError: If the mesh file cannot be read.
+    """
     try:
-        prepared = load_prepared(task.out, task.source.name, task.config)
+        prepared = load_prepared(out, source.name, config)
     except DrakegraspError:
         return None
-    model = prepared.model
-    same = (model.class_name, model.mesh_sha256) == (task.source.class_name, digest)
-    return prepared.entry() if same and prepared.asked >= first_palms(task.config) else None
+    model, digest = prepared.model, digest or source_sha256(source)
+    same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
+    return prepared.entry() if same and prepared.asked >= first_palms(config) else None
 
 
 def _prepared_entry(task: PrepareTask, read: tuple[bytes, str]) -> ObjectEntry | RefusedMesh:

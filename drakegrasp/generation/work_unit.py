@@ -43,8 +43,6 @@ from drakegrasp.runtime.environment import one_thread, trim_memory
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import (
     ATTEMPT,
-    GIVE_UP_DEATHS,
-    NO_JOURNAL,
     Journal,
     Verdict,
     inject_fault,
@@ -143,12 +141,11 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
             summary = _find_unit(out, header, unit.config)
         except DataError:
             summary = None
-        if summary is None and unit.restartable:
-            with open_journal(header.journal_path(out), header.stored) as journal:
+        path = header.journal_path(out)
+        if summary is None:
+            with open_journal(path, header.stored, restartable=unit.restartable) as journal:
                 summary = _Experiment(unit, journal).run()
-        elif summary is None:
-            summary = _Experiment(unit, NO_JOURNAL).run()
-        header.journal_path(out).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
         trim_memory()
         return summary
 
@@ -165,12 +162,9 @@ class _Experiment:
         self._unit, self._config, self._journal = unit, unit.config, journal
         self._errors: Counter[str] = Counter()
         header = unit.header
-        if journal.in_crash_loop:
-            raise MachineError(
-                f"{header.object_name}, palm poses {header.start} to {header.stop - 1}: the worker "
-                f"died {GIVE_UP_DEATHS} times in a row in this work unit; is there enough memory? "
-                "The same command continues from here"
-            )
+        journal.validate_no_loop(
+            f"{header.object_name}, palm poses {header.start} to {header.stop - 1}"
+        )
         with self._step("build"):
             self._setup = self._build_setup()
             indices = range(header.start, header.stop)

@@ -35,9 +35,10 @@ import os
 import runpy
 import signal
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from io import FileIO
 from pathlib import Path
@@ -45,6 +46,7 @@ from typing import Any
 
 from filelock import lock_descriptor
 
+from drakegrasp.errors import MachineError
 from drakegrasp.foreign_files import LARGEST_TEXT, validate_regular
 from drakegrasp.runtime.files import temporary_name
 
@@ -84,42 +86,28 @@ class Verdict(Enum):
     VANISHED = "was at work whenever its process vanished, as for lack of memory"
 
 
-@dataclass(frozen=True)
-class Deaths:
-    """Successive deaths in one step.
-
-    Attributes:
-        native: Number of crashes.
-        silent: Number of deaths without a mark.
-        hung: Number of exceeded time limits.
-    """
-
-    native: int = 0
-    silent: int = 0
-    hung: int = 0
-
-
 @dataclass
 class _History:
     """How earlier runs of a unit died.
 
     Attributes:
-        deaths: Deaths by step.
+        deaths: Number of deaths by step, and by the name of the verdict to which they lead.
         crash_loop: Number of deaths since the last verdict.
     """
 
-    deaths: dict[str, Deaths] = field(default_factory=dict)
+    deaths: dict[str, Counter[str]] = field(default_factory=dict)
     crash_loop: int = 0
 
     def verdict(self, step: str) -> Verdict | None:
-        deaths = self.deaths.get(step, Deaths())
-        if deaths.hung >= HUNG_DEATHS:
-            return Verdict.HUNG
-        if deaths.native >= NATIVE_DEATHS:
-            return Verdict.CRASHED
         # A process that dies before its first step does not die because of the unit.
-        most = PREPARE_DEATHS if step == PREPARE else SILENT_DEATHS
-        return Verdict.VANISHED if deaths.silent >= most and step != _START else None
+        if step == _START or step not in self.deaths:
+            return None
+        most = {
+            Verdict.HUNG: HUNG_DEATHS,
+            Verdict.CRASHED: NATIVE_DEATHS,
+            Verdict.VANISHED: PREPARE_DEATHS if step == PREPARE else SILENT_DEATHS,
+        }
+        return next((v for v in Verdict if self.deaths[step][v.name] >= most[v]), None)
 
     def unresolved(self) -> list[str]:
         return [step for step in self.deaths if self.verdict(step) is None]
@@ -136,14 +124,12 @@ class _History:
         for i, cleared in enumerate(self.unresolved()):
             if passed >> i & 1:
                 del self.deaths[cleared]
-        before = self.deaths.get(step, Deaths())
+        manner = Verdict.VANISHED
         if _CRASH_MARK in marks:
-            now = replace(before, native=before.native + 1)
+            manner = Verdict.CRASHED
         elif any(mark in marks for mark in _TIME_MARKS):
-            now = replace(before, hung=before.hung + 1)
-        else:
-            now = replace(before, silent=before.silent + 1)
-        self.deaths[step] = now
+            manner = Verdict.HUNG
+        self.deaths.setdefault(step, Counter())[manner.name] += 1
         self.crash_loop = 0 if self.verdict(step) else self.crash_loop + 1
 
 
@@ -159,10 +145,20 @@ class Journal:
         """Steps in which a process died, still without a verdict; run these first, in order."""
         return self._history.unresolved()
 
-    @property
-    def in_crash_loop(self) -> bool:
-        """Whether the unit died many times without a verdict on any step."""
-        return self._history.crash_loop >= GIVE_UP_DEATHS
+    def validate_no_loop(self, work: str) -> None:
+        """Give up work that killed its process many times without a verdict on any step.
+
+        Args:
+            work: What the work is, for the message.
+
+        Raises:
+            MachineError: If it did.
+        """
+        if self._history.crash_loop >= GIVE_UP_DEATHS:
+            raise MachineError(
+                f"{work}: the worker died {GIVE_UP_DEATHS} times in a row; is there enough memory? "
+                "The same command continues from here"
+            )
 
     def verdict(self, step: str) -> Verdict | None:
         """Return why a step must not be tried again; None if it may be tried."""
@@ -213,7 +209,9 @@ NO_JOURNAL = Journal(None, 0, _History())
 
 
 @contextmanager
-def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
+def open_journal(
+    path: Path, identity: Mapping[str, Any], *, restartable: bool = True
+) -> Iterator[Journal]:
     """Keep a journal while the block runs, including what is known of earlier runs that died.
 
     It is removed when the block ends, even with an exception, because the caller then learns how
@@ -222,14 +220,18 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     Args:
         path: Path of the journal.
         identity: Identifies the unit, as JSON types; a journal of another unit is ignored.
+        restartable: Whether this process is started again when it dies; if not, nothing is
+            recorded.
 
     Raises:
         OSError: If the file cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    history = _read_history(path, identity)
+    history = None
+    if restartable:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        history = _read_history(path, identity)
     if history is None:
-        # Another process also runs this unit: both will write the same shard.
+        # Or another process also runs this unit: both will write the same shard.
         yield NO_JOURNAL
         return
 
@@ -237,7 +239,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     line = json.dumps(
         {
             "unit": dict(identity),
-            "deaths": {step: asdict(deaths) for step, deaths in history.deaths.items()},
+            "deaths": history.deaths,
             "crash_loop": history.crash_loop,
         },
         ensure_ascii=False,
@@ -289,7 +291,7 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
 
         # The deaths of earlier runs, and the step in which the last one ended.
         for step, deaths in content["deaths"].items():
-            history.deaths[step] = Deaths(**deaths)
+            history.deaths[step] = Counter(deaths)
         history.crash_loop = int(content["crash_loop"])
         passed, step = rest[:_RECORD_SIZE].decode("ascii").split(maxsplit=1)
         history.add(step.strip(), int(passed, 16), rest[_RECORD_SIZE:])
