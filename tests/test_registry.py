@@ -14,7 +14,7 @@ from drakegrasp import registry
 from drakegrasp.config import parse_config, parse_stored
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.files import MODELS, hand_names
+from drakegrasp.hand.file_format import MODELS, hand_names
 from drakegrasp.hand.settings import load_config
 
 KINDS: tuple[registry.Kind, ...] = (

@@ -98,7 +98,7 @@ def export_objects(directory: Folder, /, *, per_class: Count = 2, objects_seed: 
 @hand.command(name="list")
 def list_hands() -> None:
     """Print the names of the hands that come with the package."""
-    from drakegrasp.hand.files import hand_names
+    from drakegrasp.hand.file_format import hand_names
 
     for name in hand_names():
         say(name)

@@ -45,8 +45,7 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.split import Home
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
-from drakegrasp.hand.file_format import read_hand_file
-from drakegrasp.hand.files import hand_file
+from drakegrasp.hand.file_format import hand_file, read_hand_file
 from drakegrasp.hand.folder import HAND_FOLDER, carried_hand, hand_digest
 from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.files import probe_folder, write_atomic

@@ -36,11 +36,9 @@ from drakegrasp.hand.file_format import (
     Finger,
     HandFile,
     Spread,
-    foreign_frames,
-    rated_load,
+    hand_file,
     read_hand_file,
 )
-from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.folder import hand_folder
 from drakegrasp.hand.parsing import (
     KEPT_HANDS,
@@ -206,7 +204,7 @@ def load_hand(source: HandSource = "barrett") -> Hand:
     """Return a hand of the package, the hand of a YAML file, or the hand of a dataset.
 
     Args:
-        source: One of `files.hand_names()`, the path of a YAML file with the keys of
+        source: One of `file_format.hand_names()`, the path of a YAML file with the keys of
             `file_format.HandFile`, whose `model` is a path relative to the YAML file, or
             `Config.hand_source` of a dataset's configuration for the dataset's hand.
 
@@ -313,7 +311,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         model=model,
         palm_link=palm.link,
         X_BG=X_BG,
-        frames={n: _pose(f.rpy_deg, f.p_BA) for n, f in foreign_frames(described).items()},
+        frames={n: _pose(f.rpy_deg, f.p_BA) for n, f in described.frames.items()},
         fingers=described.driven_fingers(),
         drive=described.drive,
         spread=described.spread,
@@ -322,7 +320,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         standoffs=described.standoffs,
         spreads_deg=described.spreads_deg,
         payload=described.payload,
-        rated_load=rated_load(described),
+        rated_load=described.rated_load,
         joint_names=tuple(moving),
         joint_slides=np.array([joint_slides(joint) for joint in moving.values()], dtype=np.bool_),
         joint_gain=np.array([drives[joint][0] for joint in moving]),

@@ -1,7 +1,7 @@
-"""The keys of a hand file, version 1. Does not import Drake.
+"""Hand files: where they are, and their keys, version 1. Does not import Drake.
 
-Input: a YAML file. Output: a `HandFile` whose values are valid by themselves; `description` checks
-them against the model. docs/how-to/add-a-hand.md lists the keys.
+Input: a hand, and its YAML file. Output: a `HandFile` whose values are valid by themselves;
+`description` checks them against the model. docs/how-to/add-a-hand.md lists the keys.
 
 A joint is either revolute or prismatic. Positions of revolute joints are angles [rad], positions of
 prismatic joints are lengths [m].
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import chain
 from math import sqrt
 from pathlib import Path
@@ -29,13 +28,15 @@ from pydantic import (
     with_config,
 )
 
-from drakegrasp.config import Standoffs, describe_mistake
+from drakegrasp import registry
+from drakegrasp.config import CarriedHand, HandSource, Standoffs, describe_mistake
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array
-from drakegrasp.hand.files import MODELS
-from drakegrasp.yaml_text import parse_yaml, parse_yaml_once
+from drakegrasp.yaml_text import parse_yaml_once
 
+#: Folder of the package's hand files `<name>_hand.yaml`, their models and the table's model.
+MODELS = Path(__file__).resolve().parent.parent / "models"
 #: Version of the keys that this module reads.
 VERSION = 1
 
@@ -362,42 +363,6 @@ class HandFile(BaseModel):
         return np.array(speeds)
 
 
-def rated_load(described: HandFile) -> float | None:
-    """Return the largest fingertip force that the manufacturer allows [N]; None if unknown.
-
-    Args:
-        described: The hand's file. Files of the package's hands do not contain the force. Such a
-            hand is recognized by the contents of its file, because a user-defined hand may have any
-            name.
-    """
-    of_package = (load for other, load in _rated_loads() if other == described)
-    return described.rated_load or next(of_package, None)
-
-
-@cache
-def _rated_loads() -> list[tuple[HandFile, float]]:
-    loads: dict[str, float] = parse_yaml(read_text(MODELS / "rated_loads.yaml"))
-    return [(read_hand_file(MODELS / f"{name}_hand.yaml"), loads[name]) for name in loads]
-
-
-def foreign_frames(described: HandFile) -> dict[str, ForeignFrame]:
-    """Return frames of other tools by name; hands of the package are found as in `rated_load`."""
-    of_package = (frames for other, frames in _foreign_frames() if other == described)
-    return described.frames or next(of_package, {})
-
-
-@cache
-def _foreign_frames() -> list[tuple[HandFile, dict[str, ForeignFrame]]]:
-    frames: dict[str, dict[str, Any]] = parse_yaml(read_text(MODELS / "frames.yaml"))
-    return [
-        (
-            read_hand_file(MODELS / f"{name}_hand.yaml"),
-            {tool: ForeignFrame.model_validate(frame) for tool, frame in own.items()},
-        )
-        for name, own in frames.items()
-    ]
-
-
 def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:
     """Return a finger with another effort limit and holding effort.
 
@@ -410,6 +375,46 @@ def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides:
     if slides:
         return replace(finger, force_limit=limit, holding_force=holding)
     return replace(finger, torque_limit=limit, holding_torque=holding)
+
+
+def hand_names() -> list[str]:
+    """Return the names of the package's hands and of the hands that plugins register."""
+    ours = (path.name.removesuffix("_hand.yaml") for path in MODELS.glob("*_hand.yaml"))
+    return sorted({*ours, *registry.names("hands")})
+
+
+def hand_file(source: HandSource) -> Path:
+    """Return the YAML file of a registered hand, of a dataset's hand, or the given file.
+
+    Raises:
+        HandError: If there is no such file, or the path of a dataset's hand leads elsewhere.
+    """
+    if isinstance(source, CarriedHand):
+        validate_inside(source.path, source.path.parent)
+        return source.path
+    path = MODELS / f"{source}_hand.yaml"
+    if source in hand_names() and not path.exists():
+        path = Path(registry.find("hands", str(source)))
+    elif source not in hand_names():
+        path = Path(source)
+    if not path.is_file():
+        names = ", ".join(hand_names())
+        raise HandError(f"hand must be one of {names} or a YAML file, got {str(source)!r}")
+    return path
+
+
+def validate_inside(path: Path, folder: Path) -> None:
+    """Reject a path that is not a plain file of a folder; the folder may be a stranger's.
+
+    Raises:
+        HandError: If the path is missing or no file, or if it or the folder is a link.
+    """
+    try:
+        found, real = path.resolve(strict=True), folder.parent.resolve() / folder.name
+    except (OSError, RuntimeError, ValueError):
+        raise HandError(f"{path}: must be a file of the dataset's hand, got none") from None
+    if not (found.is_relative_to(real) and found.is_file()):
+        raise HandError(f"{path}: must be a file in {folder}, got a link or no file")
 
 
 def hand_keys(path: Path) -> Any:

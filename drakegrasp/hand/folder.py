@@ -25,8 +25,7 @@ from xml.sax.saxutils import unescape
 from drakegrasp.config import CarriedHand, Config, HandSource
 from drakegrasp.errors import DataError, HandError
 from drakegrasp.foreign_files import parse_json
-from drakegrasp.hand.file_format import hand_keys
-from drakegrasp.hand.files import REFERENCES, hand_file, validate_inside
+from drakegrasp.hand.file_format import hand_file, hand_keys, validate_inside
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 
 #: Maximum total size [byte], YAML size [byte] and number of a hand's files; a stranger may have
@@ -38,6 +37,12 @@ KEPT = 32
 _LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
 #: Suffixes of models and of files that a model may include.
 _MODELS = (".sdf", ".urdf", ".xml")
+#: References in a model: meshes and models in SDFormat, meshes in URDF, then textures.
+REFERENCES = re.compile(
+    rb"<uri>\s*(?P<uri>.*?)\s*</uri>|<mesh\b[^>]*\bfilename\s*=\s*[\"'](?P<mesh>.*?)[\"']"
+    rb"|<texture\b[^>]*\bfilename\s*=\s*[\"'](?P<texture>.*?)[\"']"
+    rb"|<drake:diffuse_map>\s*(?P<map>.*?)\s*</drake:diffuse_map>"
+)
 #: References in Wavefront files: materials, and their textures at the end of a line.
 _MATERIALS = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE)
 _TEXTURES = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|norm)[ \t](?:.*[ \t])?(\S+)[ \t\r]*$", re.M)

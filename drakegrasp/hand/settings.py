@@ -21,8 +21,7 @@ from drakegrasp.config import (
     read_settings,
 )
 from drakegrasp.errors import ConfigError
-from drakegrasp.hand.file_format import read_hand_file
-from drakegrasp.hand.files import hand_file, hand_names
+from drakegrasp.hand.file_format import hand_file, hand_names, read_hand_file
 from drakegrasp.registry import read_class
 
 #: Keys of `candidates` that are taken from the hand's file if they are missing or null.

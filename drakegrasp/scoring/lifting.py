@@ -22,7 +22,7 @@ from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose, make_pose
 from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.files import hand_names
+from drakegrasp.hand.file_format import hand_names
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.cloud import Solid
 from drakegrasp.objects.model import object_of

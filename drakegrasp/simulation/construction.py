@@ -66,8 +66,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import FINGER_DAMPING, Hand
-from drakegrasp.hand.file_format import Finger, with_efforts
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS, Finger, with_efforts
 from drakegrasp.hand.kinematics import within_load
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners

@@ -44,7 +44,7 @@ from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, transform_points
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel

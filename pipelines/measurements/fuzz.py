@@ -50,7 +50,7 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.hand.checks import check_geometry, check_limits
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.shapes import link_shapes
 
 #: Memory that a process may use in addition to this one's [byte], its CPU time [s], and the

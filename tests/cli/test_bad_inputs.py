@@ -27,7 +27,7 @@ from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
 from drakegrasp.dataset.manifest import DIGEST, manifest_digest
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.page.attempts import Attempts
 
 MANIFEST, REJECT = "manifest.json", "reject.json"

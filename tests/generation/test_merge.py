@@ -30,7 +30,7 @@ from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.errors import DataError
 from drakegrasp.generation.merge import merge
 from drakegrasp.generation.replay import replay_trial
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome

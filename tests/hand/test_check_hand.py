@@ -13,7 +13,7 @@ from helpers.tiers import in_second_tier
 
 from drakegrasp.hand.checks import Finding
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.files import MODELS, hand_names
+from drakegrasp.hand.file_format import MODELS, hand_names
 from drakegrasp.hand_setup import check_hand
 from drakegrasp.verification.wrist_problem import hand_constants
 

@@ -14,7 +14,7 @@ from helpers.vendors import box, fixed, link
 
 from drakegrasp.hand.checks import check_palm
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand_setup import LINES, check_grasp, trial_grasps
 

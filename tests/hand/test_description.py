@@ -26,8 +26,7 @@ from drakegrasp.frames import Array
 from drakegrasp.hand import folder
 from drakegrasp.hand.checks import overlap_query
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.file_format import Coupling
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS, Coupling
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
 from drakegrasp.hand.parsing import add_model

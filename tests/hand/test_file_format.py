@@ -78,10 +78,3 @@ def test_a_mesh_that_is_missing_is_named(tmp_path: Path) -> None:
     hand = load_hand(write_slider(tmp_path, urdf))
     with pytest.raises(HandError, match=r"model: .*gone\.obj"):
         link_shapes(hand.model)
-
-
-def test_a_rated_load_of_the_package_is_of_its_own_hand_file(tmp_path: Path) -> None:
-    """Not of a user's hand of the same name, whose file says nothing."""
-    assert load_hand("barrett").rated_load == pytest.approx(19.62)
-    user = write_pincer(tmp_path).rename(tmp_path / "barrett_hand.yaml")
-    assert load_hand(user).rated_load is None

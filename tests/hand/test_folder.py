@@ -15,7 +15,7 @@ from drakegrasp.config import CarriedHand, Config
 from drakegrasp.errors import DiskFullError, HandError
 from drakegrasp.hand import folder as carrying
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.folder import carry_hand, hand_digest, hand_folder
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes

@@ -16,8 +16,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.draft.fingers import Answers
 from drakegrasp.hand.draft.shapes import THIN, Shape
-from drakegrasp.hand.file_format import DrivenBy
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS, DrivenBy
 from drakegrasp.hand.finger_sweep import pad_points_at
 from drakegrasp.hand.kinematics import closed_positions, fingertip_forces
 from drakegrasp.hand_setup import NewHand, draft_hand

@@ -8,7 +8,7 @@ from helpers.hands import drake_fingertip_poses
 
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.files import hand_names
+from drakegrasp.hand.file_format import hand_names
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_forces, fingertip_poses
 
 #: Centres of the round tips in the fingertip links [m]; SimLab's URDF.
@@ -55,6 +55,7 @@ def test_these_hands_come_with_the_package() -> None:
         assert (hand.name, hand.num_fingers) == (name, fingers)
         assert 6 * hand.num_fingers == numbers
         assert hand.payload is not None
+    assert load_hand("barrett").rated_load == 19.62
 
 
 @pytest.mark.parametrize(

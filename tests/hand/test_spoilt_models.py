@@ -14,7 +14,7 @@ from helpers.vendors import JAWS, JAWS_MJCF, fixed, link, write_model
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.source import read_model
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.shapes import link_shapes
 
 MIMIC = '<mimic joint="left_slide"/>'

@@ -12,7 +12,7 @@ import yaml
 
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.files import hand_file
+from drakegrasp.hand.file_format import hand_file
 from drakegrasp.hand.folder import hand_folder
 from drakegrasp.pictures.still_scene import StillScene
 

@@ -9,7 +9,7 @@ from helpers.objects import from_above, standing
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.files import hand_names
+from drakegrasp.hand.file_format import hand_names
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import (

@@ -14,7 +14,7 @@ from helpers.objects import model_of
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
-from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import (
     TABLE_COLOUR,

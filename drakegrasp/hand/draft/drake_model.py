@@ -28,7 +28,7 @@ from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_content
 from drakegrasp.hand.draft.shapes import Shape, read_mesh, read_shape
 from drakegrasp.hand.draft.vendor import Link, VendorJoint, VendorModel
-from drakegrasp.hand.files import REFERENCES
+from drakegrasp.hand.folder import REFERENCES
 from drakegrasp.hand.parsing import (
     ModelFile,
     add_model,
