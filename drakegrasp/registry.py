@@ -113,16 +113,21 @@ def _ours(kind: Kind) -> dict[str, EntryPoint]:
     group = f"drakegrasp.{kind}"
     try:
         project = tomllib.loads(_PROJECT.read_text(encoding="utf-8"))["project"]
-        entries = project["entry-points"][group] if project["name"] == "drakegrasp" else {}
-        return {name: EntryPoint(name, value, group) for name, value in entries.items()}
-    except (OSError, KeyError, ValueError):  # installed, and no checkout
-        found = metadata.distribution("drakegrasp").entry_points.select(group=group)
-        return {entry.name: entry for entry in found}
+        if project["name"] == "drakegrasp":
+            entries = project["entry-points"][group].items()
+            return {name: EntryPoint(name, value, group) for name, value in entries}
+    except (OSError, KeyError, ValueError):
+        pass
+    # Installed, and no checkout.
+    found = metadata.distribution("drakegrasp").entry_points.select(group=group)
+    return {entry.name: entry for entry in found}
 
 
 @cache
 def _theirs(kind: Kind) -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in metadata.entry_points(group=f"drakegrasp.{kind}")}
+    entries = metadata.entry_points(group=f"drakegrasp.{kind}")
+    # The metadata of a checkout is as old as its installation.
+    return {entry.name: entry for entry in entries if _package(entry) != "drakegrasp"}
 
 
 # User-defined classes

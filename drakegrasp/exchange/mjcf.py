@@ -35,7 +35,7 @@ from drakegrasp.runtime.progress import Report
 from drakegrasp.vision.camera import object_colour
 
 #: Description of the format in `drakegrasp export --help`.
-HELP = "the same for MuJoCo, with the table; needs drakegrasp[peer]"
+HELP = "a MuJoCo scene per grasp: the closed hand, the object, the table; needs drakegrasp[peer]"
 
 #: Half extents of the table [m]; its top is at z = 0.
 TABLE = (0.8, 0.8, 0.05)

@@ -53,7 +53,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "export original": ("export", "{out}", "{to}/original", "--to", "original", "--quiet"),
     "export hf": ("export", "{out}", "{to}/hf", "--to", "hf", "--quiet"),
     "export dexgraspbench": ("export", "{out}", "{to}/dex", "--to", "dexgraspbench", "--quiet"),
-    "export glb": ("export", "{out}", "{to}/glb", "--to", "glb", "--quiet"),
+    "export isaac_grasp": ("export", "{out}", "{to}/glb", "--to", "glb", "--quiet"),
     "verify": (
         "verify",
         f"{{out}}/{OTO}",
@@ -216,21 +216,21 @@ FILES: dict[str, tuple[Sequence[Kind], tuple[str, ...]]] = {
     MANIFEST: (
         manifests.MANIFEST,
         (
-            *("replay", "stats", "assemble", "check", "figures", "export glb"),
+            *("replay", "stats", "assemble", "check", "figures", "export isaac_grasp"),
             *("export dexgraspbench", "verify", "build"),
         ),
     ),
     TRIALS: (
         hdf5_kinds.TRIALS,
         (
-            *("stats", "check", "replay", "figures", "inspect", "export glb"),
+            *("stats", "check", "replay", "figures", "inspect", "export isaac_grasp"),
             "export dexgraspbench",
         ),
     ),
     OTO: (
         hdf5_kinds.DATA,
         (
-            *("stats", "check", "inspect", "export glb", "export dexgraspbench"),
+            *("stats", "check", "inspect", "export isaac_grasp", "export dexgraspbench"),
             *("export original", "export hf", "verify"),
         ),
     ),

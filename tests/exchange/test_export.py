@@ -89,7 +89,7 @@ def test_export_that_fails_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("form", ["isaac_grasp", "dexgraspbench", "glb", "mjcf"])
+@pytest.mark.parametrize("form", ["isaac_grasp", "dexgraspbench", "mjcf"])
 @pytest.mark.parametrize(
     ("name", "value"), [("X_TO", np.nan), ("closed_q", np.inf), ("spread", -np.inf)]
 )

@@ -61,7 +61,7 @@ SAMPLES = (
 
 #: Formats of an export that only go out: contacts, meshes, pictures or scenes, from
 #: which no posture of the hand is read.
-ONLY_OUT = {"hf", "original", "meshes", "glb", "mjcf"}
+ONLY_OUT = {"hf", "original", "meshes", "mjcf"}
 #: Layouts of postures that users write.
 OWN = ("npz", "hdf5")
 

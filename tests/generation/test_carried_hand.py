@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import trimesh
+import yaml
 from helpers.builds import build
 from helpers.commands import error_line, run
 from helpers.hands import write_tongs
@@ -93,11 +93,11 @@ def test_its_grasps_are_verified(passed_on: Path) -> None:
     assert verdicts and all(verdict["outcome"] != "invalid" for verdict in verdicts)
 
 
-def test_an_export_has_the_links_of_the_hand(passed_on: Path, tmp_path: Path) -> None:
-    result = run("export", passed_on, tmp_path / "scenes", "--to", "glb", "--quiet")
+def test_an_export_has_the_palm_of_the_hand(passed_on: Path, tmp_path: Path) -> None:
+    result = run("export", passed_on, tmp_path / "grasps", "--to", "isaac_grasp", "--quiet")
     assert result.exit_code == 0, result.output
-    scene = trimesh.load_scene(next((tmp_path / "scenes").rglob("*.glb")))
-    assert any("left_tip" in name for name in scene.graph.nodes)
+    tree = yaml.safe_load(next((tmp_path / "grasps").glob("*.yaml")).read_text("utf-8"))
+    assert tree["gripper_frame"] == load_hand(read_manifest(passed_on).config.hand_source).palm_link
 
 
 def test_it_names_the_joints_of_the_hand(passed_on: Path) -> None:
