@@ -320,6 +320,16 @@ class CameraConfig(_Section):
     near: Positive = 0.01  # [m]
     far: Positive = 0.75  # [m]
 
+    @property
+    def width(self) -> int:
+        """Width of the images [px], as in `ScenesConfig`."""
+        return self.size
+
+    @property
+    def height(self) -> int:
+        """Height of the images [px]."""
+        return self.size
+
     @model_validator(mode="after")
     def _ordered(self) -> CameraConfig:
         if self.near >= self.far:

@@ -38,7 +38,7 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import SLIDE, Hand
 from drakegrasp.hand.parsing import add_model, joint_axis, joint_slides, moving_joint
 from drakegrasp.hand.shapes import hull_corners
-from drakegrasp.mesh.wavefront import hull_text
+from drakegrasp.mesh.surfaces import hull_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.files import write_atomic
 

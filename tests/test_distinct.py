@@ -7,14 +7,14 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from drakegrasp.distinct import (
+from drakegrasp.frames import make_pose, rotation_about
+from drakegrasp.grasp import (
     approach_cells,
     cell_directions,
     distinct_grasps,
     elevation,
     elevation_bands,
 )
-from drakegrasp.frames import make_pose, rotation_about
 
 
 def pose(x: float = 0.0, turn_deg: float = 0.0, axis: tuple[float, ...] = (0, 0, 1)) -> np.ndarray:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drakegrasp.arithmetic import Array
     from drakegrasp.hand.description import Hand
     from drakegrasp.simulation.attempts import Attempts
-    from drakegrasp.vision.completion import View
+    from drakegrasp.vision.depth_image import View
 
 #: Suffixes of scenes, and of files of postures that are written.
 HDF5 = (".h5", ".hdf5")
@@ -266,7 +266,7 @@ def _see(
     from drakegrasp.exchange.columns import read_numbers
     from drakegrasp.frames import read_pose
     from drakegrasp.vision import depth_image as images
-    from drakegrasp.vision.completion import View
+    from drakegrasp.vision.depth_image import View
 
     K, own, off = images.read_camera(camera, depth.shape), images.read_mask(mask), ""
     if camera_pose is not None:

@@ -21,9 +21,9 @@ from drakegrasp.dataset.statistics import (
     objects_without_samples,
     validate_assembled,
 )
-from drakegrasp.distinct import BANDS
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
+from drakegrasp.grasp import BANDS
 from drakegrasp.outcomes import GROUPS, Outcome
 
 #: Outcomes in the order of the funnel. Outcomes that only verdicts have are not among them.

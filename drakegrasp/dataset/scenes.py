@@ -41,7 +41,7 @@ from drakegrasp.frames import X_WT, Frame, invert_pose, pack_pose, unpack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.outcomes import LOST, Outcome
 from drakegrasp.seeding import Stream
-from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
+from drakegrasp.vision.camera import DepthSensor, spoil_depth
 
 #: Frames of the grasps of a view.
 FRAMES = (Frame.TABLE, Frame.CAMERA)

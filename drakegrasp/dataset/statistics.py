@@ -17,15 +17,10 @@ from drakegrasp.dataset.paths import ASSEMBLED_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.survey import shards_sha256
 from drakegrasp.dataset.trials import NONE, Trials
-from drakegrasp.distinct import (
-    BANDS,
-    approach_cells,
-    distinct_grasps,
-    elevation_bands,
-)
 from drakegrasp.errors import DataError, counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
+from drakegrasp.grasp import BANDS, approach_cells, distinct_grasps, elevation_bands
 from drakegrasp.outcomes import Outcome
 from drakegrasp.table import Table
 

@@ -44,7 +44,7 @@ from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.mesh.wavefront import hull_text
+from drakegrasp.mesh.surfaces import hull_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.protocols.files import POSTURES, read_grasp_file

@@ -24,7 +24,7 @@ from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.attempts import CONDITIONS, quaternion_poses
 from drakegrasp.simulation.posture import joint_order

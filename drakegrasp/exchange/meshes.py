@@ -14,7 +14,7 @@ import yaml
 
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.objects.sources import MANIFEST_NAME
 from drakegrasp.runtime.progress import Report

@@ -21,7 +21,7 @@ from drakegrasp.exchange.dexgraspbench import pose_vector
 from drakegrasp.exchange.export import ClosedGrasp, samples_by_object
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_plain_hand
-from drakegrasp.mesh.wavefront import hull_text
+from drakegrasp.mesh.surfaces import hull_text
 from drakegrasp.mjcf import (
     MEMORY,
     convex_parts,

@@ -38,8 +38,13 @@ from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, for
 from drakegrasp.simulation.screen import Prediction, centred, predict
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.table import AnyArray, Table
-from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
-from drakegrasp.vision.depth_sensor import spoil_depth
+from drakegrasp.vision.camera import (
+    camera_pose_otm,
+    camera_pose_oto,
+    image_frame,
+    intrinsics,
+    spoil_depth,
+)
 from drakegrasp.vision.rendering import Renderer, paint, render
 
 #: Number of prepared objects that a process caches; the next unit mostly has the same object.

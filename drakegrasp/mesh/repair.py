@@ -8,8 +8,8 @@ solid keeps its own vertices.
 
 The order matters: gaps are stitched and inner walls are dropped while neighbours are still known.
 Then the surface is separated into `components`, whose holes are closed. Finally the components are
-united (`union`), and the result is checked by generalised winding numbers, which are independent of
-the previous steps.
+united, and the result is checked by generalised winding numbers, which are independent of the
+previous steps.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ from drakegrasp.arithmetic import norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import (
+    check_self_intersection,
     close_rims,
     edge_ids,
     face_components,
     find_components,
     pair_half_edges,
     part_touching_edges,
+    unite,
 )
 from drakegrasp.mesh.surfaces import (
     Faces,
@@ -40,7 +42,6 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
     winding_numbers,
 )
-from drakegrasp.mesh.union import check_self_intersection, unite
 
 #: Vertices closer than this fraction of the diagonal are merged: above the rounding of files
 #: with eight digits, far below the detail of any scan.

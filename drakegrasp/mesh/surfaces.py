@@ -1,7 +1,11 @@
-"""Surfaces of triangles: measures, points on them, inside and outside, other forms.
+"""Surfaces of triangles: measures, points on them, inside and outside, rays, other forms.
 
 Vertices are (n, 3) [m]; faces are (m, 3), counter-clockwise seen from outside. Nothing here changes
 a shape.
+
+Where rays meet a surface has the same bits on every machine, since only sums, products and roots
+are used. Embree cannot replace it: it computes in single precision, with kernels that depend on the
+CPU.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from dataclasses import dataclass
 import manifold3d
 import numpy as np
 import numpy.typing as npt
+import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -36,6 +41,15 @@ NEAR = 3e-4
 #: properties, but not the surface that is touched (slots of real toasters are dents deeper than the
 #: wall).
 MAX_OVERLAP = 0.05
+#: A ray that misses a triangle by this fraction of its size still meets it, so that no ray passes
+#: between two triangles.
+RAY_EDGE = 1e-9
+#: Margin of the sphere around a triangle [m], far above rounding.
+RAY_MARGIN = 1e-6
+#: Number of pairs of a ray and a triangle that are tested together; they fit into a CPU's cache.
+RAY_PAIRS = 65_536
+#: Faces that meet at an angle below this are shaded as one smooth surface.
+CREASE_DEG = 30.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -277,6 +291,60 @@ def cover_triangles(triangles: Array, spacing: float) -> tuple[Array, Faces]:
     return np.concatenate(points), np.concatenate(owners)
 
 
+# Rays
+
+
+def first_hits(triangles: Array, p: Array, z: Array) -> Array:
+    """Return the distance (n,) [m] at which each ray first meets a triangle; inf if it meets none.
+
+    Möller and Trumbore's test (1997); a ray through an edge or a corner counts as a hit.
+
+    Args:
+        triangles: Corners (m, 3, 3) [m].
+        p: Starting points of the rays, (n, 3) [m].
+        z: Unit directions of the rays, (n, 3).
+    """
+    # A sphere around each triangle.
+    a, b, c = np.moveaxis(np.asarray(triangles, dtype=float), 1, 0)
+    centre = (a + b + c) / 3.0
+    radius = np.sqrt(np.max([dot(q - centre, q - centre) for q in (a, b, c)], axis=0, initial=0.0))
+
+    # Test only triangles whose sphere the ray meets.
+    distance = np.full(len(p), np.inf)
+    step = max(1, RAY_PAIRS // max(1, len(a)))
+    for start in range(0, len(p), step):
+        block = slice(start, start + step)
+        ray, triangle = np.nonzero(_pass_spheres(p[block], z[block], centre, radius + RAY_MARGIN))
+        ray += start
+        hits = _triangle_hits(p[ray], z[ray], a[triangle], b[triangle], c[triangle])
+        np.minimum.at(distance, ray, hits)
+    return distance
+
+
+def _pass_spheres(p: Array, z: Array, centre: Array, radius: Array) -> npt.NDArray[np.bool_]:
+    """Return (n, m) whether each ray meets each sphere of centre (m, 3) and radius (m,)."""
+    along, squared = np.zeros((len(p), len(centre))), np.zeros((len(p), len(centre)))
+    for axis in range(3):
+        apart = centre[:, axis] - p[:, None, axis]
+        along += apart * z[:, None, axis]
+        squared += apart * apart
+    # The difference of two squares loses digits; RAY_MARGIN in the radius is far above this error.
+    return (squared - along * along <= radius * radius) & (along >= -radius)
+
+
+def _triangle_hits(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
+    """Return the distance (n,) at which each ray meets its triangle; inf if it does not."""
+    ab, ac, ap = b - a, c - a, p - a
+    across, up = np.cross(z, ac), np.cross(ap, ab)
+    volume = dot(ab, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v, t = dot(ap, across) / volume, dot(z, up) / volume, dot(ac, up) / volume
+        meets = (u >= -RAY_EDGE) & (v >= -RAY_EDGE) & (u + v <= 1.0 + RAY_EDGE) & (t >= 0.0)
+    # A triangle seen edge-on is skipped: the ray meets its neighbours.
+    flat = np.abs(volume) <= RAY_EDGE * norm(ab) * norm(ac)
+    return np.where(meets & ~flat, t, np.inf)
+
+
 # Other forms
 
 
@@ -350,3 +418,56 @@ def from_manifold(solid: manifold3d.Manifold) -> tuple[Array, Faces]:
     mesh = solid.to_mesh64()
     faces = np.array(mesh.tri_verts, dtype=np.int64)
     return compact(np.array(mesh.vert_properties[:, :3], dtype=np.float64), faces)
+
+
+def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) -> str:
+    """Return a triangle mesh as Wavefront text, for Drake's in-memory meshes.
+
+    Coordinates are written so that they are read back exactly. With `normals`, every corner gets
+    the area-weighted mean normal of the faces at its vertex that are within 30 degrees of its own
+    face: curved surfaces look smooth, and edges of boxes stay crisp.
+    """
+    v = np.asarray(vertices, dtype=np.float64)
+    f = np.asarray(faces, dtype=np.int64)
+    # Positions, and faces without normals if none are requested.
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in v.tolist()]
+    if not normals:
+        lines += [f"f {a} {b} {c}" for a, b, c in (f + 1).tolist()]
+        return "\n".join(lines) + "\n"
+
+    # Equal normals are written once; each corner refers to one normal.
+    vn, index = np.unique(np.round(_corner_normals(v, f), 6), axis=0, return_inverse=True)
+    lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in (vn + 0.0).tolist()]
+    corners = np.stack((f, index.reshape(f.shape)), axis=2).reshape(-1, 6) + 1
+    lines += ["f {}//{} {}//{} {}//{}".format(*row) for row in corners.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def hull_text(corners: npt.ArrayLike) -> str:
+    """Return the convex hull of corners (n, 3) as Wavefront text, with its faces turned outward."""
+    hull = trimesh.convex.convex_hull(np.asarray(corners, dtype=float))
+    return obj_text(hull.vertices, hull.faces, normals=False)
+
+
+def _corner_normals(vertices: Array, faces: Faces) -> Array:
+    """Return the unit shading normal of every corner (3m, 3)."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    weighted = np.cross(b - a, c - a)
+    unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
+
+    # Pairs of a corner and a face at its vertex.
+    corner = np.arange(faces.size)
+    at_vertex = coo_matrix(
+        (np.ones(faces.size), (faces.ravel(), corner // 3)), shape=(len(vertices), len(faces))
+    ).tocsr()
+    pairs = at_vertex[faces.ravel()].tocoo()
+
+    # The area-weighted mean of the faces within the crease angle of the corner's own face.
+    smooth = (unit[pairs.row // 3] * unit[pairs.col]).sum(axis=1) >= np.cos(np.radians(CREASE_DEG))
+    smooth |= pairs.row // 3 == pairs.col
+    rows, columns = pairs.row[smooth], pairs.col[smooth]
+    mean = (
+        coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(faces.size, len(faces))).tocsr()
+        @ weighted
+    )
+    return np.asarray(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300))

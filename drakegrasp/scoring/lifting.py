@@ -3,8 +3,8 @@
 Input: the starts of grasps in {T}, and two solids that were guessed from the object's visible
 points (`mesh.cloud`), with or without the view that shows them. Output: for each grasp the share of
 its lifts that end as a sample, and the chance that it is a sample on the real object. A grasp is
-lifted on both completed solids (`vision.completion`); if one of these lifts is a sample, it is also
-lifted with the palm aside and with less friction. Mass, friction and filters are those of the
+lifted on both completed solids (`vision.depth_image`); if one of these lifts is a sample, it is
+also lifted with the palm aside and with less friction. Mass, friction and filters are those of the
 configuration.
 """
 
@@ -30,7 +30,7 @@ from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt, usual_conditions
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene_cache import run_cached
-from drakegrasp.vision.completion import View, complete
+from drakegrasp.vision.depth_image import View, complete
 
 #: Shifts of the palm along Gx and Gy [m], and the factor of the friction, of the further lifts.
 SHIFTS, SLIPPERY = 0.004 * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]]), 0.63

@@ -29,8 +29,7 @@ from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.scoring.proposals import propose
 from drakegrasp.scoring.ranking import Ranking, rank
 from drakegrasp.simulation.attempts import Attempts, join_attempts
-from drakegrasp.vision.completion import View
-from drakegrasp.vision.depth_image import cloud_from_depth
+from drakegrasp.vision.depth_image import View, cloud_from_depth
 
 
 def predict(

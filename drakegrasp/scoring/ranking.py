@@ -24,20 +24,13 @@ from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
-from drakegrasp.scoring.lifting import (
-    LIKELY,
-    chances,
-    lift_shares,
-    lifting_config,
-    place_completed,
-)
+from drakegrasp.scoring.lifting import LIKELY, chances, lift_shares, lifting_config, place_completed
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.simulation.closing import close_on
 from drakegrasp.simulation.posture import start_of
 from drakegrasp.table import Table
-from drakegrasp.vision.completion import View
-from drakegrasp.vision.depth_image import cloud_from_depth
+from drakegrasp.vision.depth_image import View, cloud_from_depth
 
 #: Moves of the palm along its axes [m] over which a score is averaged; the first is no move.
 MOVES = 0.005 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])

@@ -10,21 +10,6 @@ from trimesh import Trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
-from drakegrasp.shapes.curves import (
-    BROAD,
-    EDGE,
-    LARGE,
-    arch,
-    between,
-    ellipse,
-    joined,
-    resample,
-    rounded_polygon,
-    rounded_rectangle,
-    scaled,
-    smooth,
-    spread_evenly,
-)
 from drakegrasp.shapes.parts import (
     SIDES,
     ball,
@@ -40,7 +25,29 @@ from drakegrasp.shapes.parts import (
     tube,
     vessel,
 )
-from drakegrasp.shapes.solids import bar, cut, extrude, flat_base, fuse, revolve, stand, sweep
+from drakegrasp.shapes.solids import (
+    BROAD,
+    EDGE,
+    LARGE,
+    arch,
+    bar,
+    between,
+    cut,
+    ellipse,
+    extrude,
+    flat_base,
+    fuse,
+    joined,
+    resample,
+    revolve,
+    rounded_polygon,
+    rounded_rectangle,
+    scaled,
+    smooth,
+    spread_evenly,
+    stand,
+    sweep,
+)
 
 
 def apple(*, radius: float, height: float) -> Trimesh:

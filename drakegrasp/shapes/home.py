@@ -10,23 +10,6 @@ from trimesh import Trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
-from drakegrasp.shapes.curves import (
-    BROAD,
-    COARSE,
-    EDGE,
-    LARGE,
-    arch,
-    between,
-    ellipse,
-    foot_and_wall,
-    joined,
-    resample,
-    rounded_polygon,
-    scaled,
-    smooth,
-    spaced,
-    spread_evenly,
-)
 from drakegrasp.shapes.parts import (
     CORNERS,
     ball,
@@ -40,7 +23,32 @@ from drakegrasp.shapes.parts import (
     rod,
     tube,
 )
-from drakegrasp.shapes.solids import bar, capped, cut, flat_base, fuse, revolve, skin, solid, sweep
+from drakegrasp.shapes.solids import (
+    BROAD,
+    COARSE,
+    EDGE,
+    LARGE,
+    arch,
+    bar,
+    between,
+    capped,
+    cut,
+    ellipse,
+    flat_base,
+    foot_and_wall,
+    fuse,
+    joined,
+    resample,
+    revolve,
+    rounded_polygon,
+    scaled,
+    skin,
+    smooth,
+    solid,
+    spaced,
+    spread_evenly,
+    sweep,
+)
 
 #: Edge length of a hat [m].
 FELT = 1.2 * EDGE

@@ -8,23 +8,6 @@ from __future__ import annotations
 import numpy as np
 from trimesh import Trimesh
 
-from drakegrasp.shapes.curves import (
-    BROAD,
-    COARSE,
-    EDGE,
-    LARGE,
-    bevelled,
-    ellipse,
-    foot_and_wall,
-    inset,
-    joined,
-    resample,
-    rounded_rectangle,
-    scaled,
-    smooth,
-    spaced,
-    spread_evenly,
-)
 from drakegrasp.shapes.parts import (
     CORNERS,
     SIDES,
@@ -42,7 +25,31 @@ from drakegrasp.shapes.parts import (
     tube,
     vessel,
 )
-from drakegrasp.shapes.solids import bar, cut, extrude, fuse, grid_box, revolve, solid, sweep
+from drakegrasp.shapes.solids import (
+    BROAD,
+    COARSE,
+    EDGE,
+    LARGE,
+    bar,
+    bevelled,
+    cut,
+    ellipse,
+    extrude,
+    foot_and_wall,
+    fuse,
+    grid_box,
+    inset,
+    joined,
+    resample,
+    revolve,
+    rounded_rectangle,
+    scaled,
+    smooth,
+    solid,
+    spaced,
+    spread_evenly,
+    sweep,
+)
 
 #: Thicknesses of a usual wall and of a thin wall [m].
 WALL, THIN = 0.005, 0.0045

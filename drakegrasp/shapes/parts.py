@@ -14,19 +14,26 @@ import trimesh
 
 from drakegrasp.arithmetic import dot, multiply, norm, sin_cos_deg
 from drakegrasp.frames import Array
-from drakegrasp.shapes.curves import (
+from drakegrasp.shapes.solids import (
     COARSE,
     EDGE,
     arc_length,
+    at_height,
+    cut,
     ellipse,
+    extrude,
+    fanned,
     inset,
     resample,
+    revolve,
     ring_angles,
     ring_size,
     rounded_rectangle,
+    skin,
+    solid,
     spread_evenly,
+    sweep,
 )
-from drakegrasp.shapes.solids import at_height, cut, extrude, fanned, revolve, skin, solid, sweep
 
 #: Signs of the two sides, and of the four corners, of symmetrical shapes.
 SIDES = (-1.0, 1.0)

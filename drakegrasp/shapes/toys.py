@@ -11,16 +11,6 @@ import numpy as np
 from trimesh import Trimesh
 
 from drakegrasp.frames import Array
-from drakegrasp.shapes.curves import (
-    BROAD,
-    EDGE,
-    LARGE,
-    joined,
-    resample,
-    ring_angles,
-    scaled,
-    smooth,
-)
 from drakegrasp.shapes.parts import (
     SIDES,
     ball,
@@ -36,7 +26,20 @@ from drakegrasp.shapes.parts import (
     tube,
     vessel,
 )
-from drakegrasp.shapes.solids import at_height, cut, flat_base, fuse
+from drakegrasp.shapes.solids import (
+    BROAD,
+    EDGE,
+    LARGE,
+    at_height,
+    cut,
+    flat_base,
+    fuse,
+    joined,
+    resample,
+    ring_angles,
+    scaled,
+    smooth,
+)
 
 #: Edge length of the animals, which have many parts [m].
 COAT = 1.25 * EDGE

@@ -29,8 +29,7 @@ from drakegrasp.config import Config, PhysicsConfig, RandomizeConfig
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.vision.camera import Appearance, usual_appearance
-from drakegrasp.vision.depth_sensor import DepthSensor
+from drakegrasp.vision.camera import Appearance, DepthSensor, usual_appearance
 
 
 class Source(IntEnum):

@@ -36,8 +36,7 @@ from drakegrasp.frames import read_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import has_paths
 from drakegrasp.hand.kinematics import coordinate_limits
-from drakegrasp.mesh.rays import first_hits
-from drakegrasp.mesh.surfaces import on_faces
+from drakegrasp.mesh.surfaces import first_hits, on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.registry import own_class, run_own
 from drakegrasp.seeding import Stream, object_key

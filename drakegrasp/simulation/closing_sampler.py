@@ -17,8 +17,8 @@ import numpy as np
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import Config
-from drakegrasp.distinct import NEAR_SHIFT, NEAR_TURN, approach_cells
 from drakegrasp.frames import invert_pose, make_pose, rotation_about, transform_points
+from drakegrasp.grasp import NEAR_SHIFT, NEAR_TURN, approach_cells
 from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.cloud import Solid
 from drakegrasp.mesh.surfaces import even_points, on_faces

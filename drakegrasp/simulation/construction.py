@@ -70,8 +70,7 @@ from drakegrasp.hand.file_format import MODELS, Finger, with_efforts
 from drakegrasp.hand.kinematics import within_load
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
-from drakegrasp.mesh.surfaces import Solid
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import Solid, obj_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.attempt import Materials
 from drakegrasp.simulation.scene import Motor, ObjectScene, Scene, joint_limits

@@ -33,10 +33,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import (
-    RigidBody,
-    SpatialInertia,
-)
+from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
@@ -46,7 +43,7 @@ from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, transform_points
 from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.parsing import make_parser
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import Appearance, Lens, object_colour, unproject, usual_appearance

@@ -35,8 +35,8 @@ import yaml
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.distinct import approach_cells, distinct_grasps, elevation_bands
 from drakegrasp.frames import unpack_pose
+from drakegrasp.grasp import approach_cells, distinct_grasps, elevation_bands
 from drakegrasp.shapes.catalog import export_builtin
 
 LISTS = Path(__file__).parent / "mesh_lists.yaml"

@@ -44,7 +44,7 @@ from drakegrasp.frames import transform_points
 from drakegrasp.generation.attempts import judge_sample
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import override_config
-from drakegrasp.mesh.rays import first_hits
+from drakegrasp.mesh.surfaces import first_hits
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.protocols.postures import prepare_trials, verify_postures
 from drakegrasp.scoring.lifting import chances
@@ -53,8 +53,7 @@ from drakegrasp.shapes.catalog import builtin_object, draw_builtin
 from drakegrasp.simulation.attempts import Attempts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.vision.camera import look_at
-from drakegrasp.vision.completion import View
-from drakegrasp.vision.depth_image import cloud_from_depth
+from drakegrasp.vision.depth_image import View, cloud_from_depth
 
 Array = npt.NDArray[np.float64]
 #: The camera: distance [m], minimum elevation and range of elevations [degree], half the width of

@@ -30,16 +30,12 @@ from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.attempts import (
-    Attempts,
-    make_attempts,
-    unknown_objects,
-)
+from drakegrasp.simulation.attempts import Attempts, make_attempts, unknown_objects
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.simulation.posture import joint_order

@@ -40,8 +40,13 @@ from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.files import SEAL_SIZE, seal
 from drakegrasp.simulation.attempt import draw_conditions
 from drakegrasp.simulation.candidates import Candidates
-from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
-from drakegrasp.vision.depth_sensor import spoil_depth
+from drakegrasp.vision.camera import (
+    camera_pose_otm,
+    camera_pose_oto,
+    image_frame,
+    intrinsics,
+    spoil_depth,
+)
 
 OTO, OTM, TRIALS = "grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drakegrasp.vision.camera import look_at
-from drakegrasp.vision.completion import View
-from drakegrasp.vision.depth_image import cloud_from_depth
+from drakegrasp.vision.depth_image import View, cloud_from_depth
 
 #: A camera of 160 x 120 pixels, which looks at a box on a table, with a wall behind the table.
 K = np.array([[150.0, 0.0, 80.0], [0.0, 152.0, 58.0], [0.0, 0.0, 1.0]])

@@ -42,7 +42,7 @@ from drakegrasp.simulation.candidates import (
     rotation_candidates,
 )
 from drakegrasp.simulation.screen import predict
-from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
+from drakegrasp.vision.camera import DepthSensor, spoil_depth
 
 #: Of the real meshes: a thin one, one with many faces, one that lies on its side.
 REAL = ("24_mug_final", "42_wineglass_final", "110_bunny_final")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drakegrasp.mesh.rays import PAIRS, first_hits
+from drakegrasp.mesh.surfaces import RAY_PAIRS, first_hits
 
 HALF = np.array([0.03, 0.04, 0.05])
 
@@ -46,7 +46,7 @@ def test_the_first_of_several_walls_counts_and_what_is_behind_does_not(grids: np
 def test_slanted_rays_agree_with_the_box_in_closed_form(grids: np.ndarray) -> None:
     """Slab by slab; more rays than fit into one block."""
     rng = np.random.default_rng(1)
-    count = 3 * PAIRS // len(grids) + 5
+    count = 3 * RAY_PAIRS // len(grids) + 5
     p = rng.normal(size=(count, 3))
     p *= 0.3 / np.linalg.norm(p, axis=1, keepdims=True)
     z = rng.uniform(-1.2, 1.2, (count, 3)) * HALF - p

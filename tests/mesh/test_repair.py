@@ -20,8 +20,8 @@ from helpers.meshes import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import drakegrasp.mesh.components
 import drakegrasp.mesh.repair
-import drakegrasp.mesh.union
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.components import part_touching_edges
 from drakegrasp.mesh.repair import weld
@@ -207,7 +207,7 @@ def test_surface_of_too_many_pieces_is_refused(tmp_path, monkeypatch):
 
 @needs_g3db
 def test_surface_that_passes_through_itself_too_much_is_refused(monkeypatch):
-    monkeypatch.setattr(drakegrasp.mesh.union, "MAX_OVERLAP", 0.02)
+    monkeypatch.setattr(drakegrasp.mesh.components, "MAX_OVERLAP", 0.02)
     (source,) = (s for s in find_meshes(G3DB, units="cm") if "toaster" in s.name)
     with pytest.raises(MeshError, match="must not pass through itself"):
         prepare_object(source)
@@ -244,12 +244,12 @@ def test_triangle_that_is_a_needle_is_collapsed_and_told():
         faces.remove(face)
         faces += [[m if v == end else v for v in face] for end in (a, b)]
     notes: list[str] = []
-    united = drakegrasp.mesh.union.unite([(vertices, np.array(faces))], 0.5, notes)
+    united = drakegrasp.mesh.components.unite([(vertices, np.array(faces))], 0.5, notes)
     assert notes == ["degenerate triangles were collapsed"]
     assert signed_volume(*united) == pytest.approx(0.008)
 
     notes.clear()
-    drakegrasp.mesh.union.unite([(solid.vertices, solid.faces)], 0.5, notes)
+    drakegrasp.mesh.components.unite([(solid.vertices, solid.faces)], 0.5, notes)
     assert notes == []
 
 
@@ -258,12 +258,12 @@ def test_triangle_that_is_a_needle_is_collapsed_and_told():
 )
 def test_what_passes_through_itself_is_kept_noted_or_refused(share, said, monkeypatch):
     """By the share of its volume that is enclosed twice."""
-    monkeypatch.setattr(drakegrasp.mesh.union, "overlap_share", lambda *_, **__: share)
+    monkeypatch.setattr(drakegrasp.mesh.components, "overlap_share", lambda *_, **__: share)
     box, notes = trimesh.creation.box([0.1, 0.2, 0.4]), []
     surface = np.asarray(box.vertices), np.asarray(box.faces)
     if said == "refused":
         with pytest.raises(MeshError, match=r"must not pass through itself, got 5\.5%"):
-            drakegrasp.mesh.union.check_self_intersection(*surface, notes)
+            drakegrasp.mesh.components.check_self_intersection(*surface, notes)
         return
-    drakegrasp.mesh.union.check_self_intersection(*surface, notes)
+    drakegrasp.mesh.components.check_self_intersection(*surface, notes)
     assert any("passes through" in note for note in notes) is (said == "noted")

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from helpers.meshes import box
 
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import obj_text
 
 
 @pytest.mark.parametrize("normals", [False, True])

@@ -13,9 +13,9 @@ from helpers.hands import write_linked
 from helpers.objects import model_of
 
 from drakegrasp.config import Config
-from drakegrasp.distinct import NEAR_SHIFT, NEAR_TURN
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.grasp import NEAR_SHIFT, NEAR_TURN
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel

@@ -10,7 +10,7 @@ from helpers.depth_images import BOX, box_view, cloud_of
 from drakegrasp.errors import TooLittleSeenError
 from drakegrasp.mesh.cloud import column_solid, hull_solid, read_cloud
 from drakegrasp.mesh.surfaces import is_solid_surface
-from drakegrasp.vision.completion import complete
+from drakegrasp.vision.depth_image import complete
 
 
 @pytest.fixture(scope="module")

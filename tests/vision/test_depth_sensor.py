@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from drakegrasp.config import CameraConfig
-from drakegrasp.vision.camera import intrinsics
-from drakegrasp.vision.depth_sensor import DepthSensor, shadow, spoil_depth
+from drakegrasp.vision.camera import DepthSensor, intrinsics, shadow, spoil_depth
 
 CONFIG = CameraConfig()
 K, FAR = intrinsics(CONFIG), np.float32(CONFIG.far)

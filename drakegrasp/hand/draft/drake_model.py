@@ -42,7 +42,7 @@ from drakegrasp.hand.parsing import (
     validate_joint,
     validate_joints,
 )
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import obj_text
 
 #: Maximum size of a model's text [bytes].
 LONGEST = 20_000_000

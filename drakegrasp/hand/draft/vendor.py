@@ -25,7 +25,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, rotation_about, transform_points
 from drakegrasp.hand.draft.shapes import Shape, added, solid_inertia
 from drakegrasp.hand.parsing import Mimic, validate_limits
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.surfaces import obj_text
 
 #: Limits of a joint that has none.
 ENDLESS = np.array([-np.inf, np.inf])
