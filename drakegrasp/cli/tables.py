@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from drakegrasp.cli.console import say
+from drakegrasp.dataset.assemble import validate_assembled
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.statistics import (
     Funnel,
@@ -19,7 +20,6 @@ from drakegrasp.dataset.statistics import (
     count_splits,
     held_note,
     objects_without_samples,
-    validate_assembled,
 )
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal

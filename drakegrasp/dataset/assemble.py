@@ -1,13 +1,15 @@
 """From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
 
 Input: a directory whose work units are all done. Output: the three files, all or none.
-`survey` reads the successes and decides which become samples; then the rows go from the
-shards into the files, some thousand at a time. This process keeps a few numbers per success,
-whatever the number of attempts. It does not import Drake.
+`survey` verifies the seals of the shards, counts their rows, reads the successes, and decides which
+of them become samples, in which split. Then the rows go from the shards into the files, some
+thousand at a time. This process keeps a few numbers per success, whatever the number of attempts.
+It does not import Drake.
 """
 
 from __future__ import annotations
 
+import hashlib
 from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -21,17 +23,20 @@ from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import (
     COLUMN_CHUNK,
     AnyArray,
     create_field,
+    open_hdf5,
     open_samples,
     open_trials,
     packed_chunk,
     read_codes,
     read_columns,
+    sizes_in,
     write_field,
 )
 from drakegrasp.dataset.lock import build_lock
@@ -42,7 +47,13 @@ from drakegrasp.dataset.manifest import (
     read_manifest,
     with_postprocessing,
 )
-from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE, model_path
+from drakegrasp.dataset.paths import (
+    ASSEMBLED_FILES,
+    DATA_FILES,
+    FILE_NAME,
+    TRIALS_FILE,
+    model_path,
+)
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import (
     CAMERAS,
@@ -56,12 +67,20 @@ from drakegrasp.dataset.schema import (
     stored_fields,
 )
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard
-from drakegrasp.dataset.survey import Decisions, ShardRows, decide, keys_of, survey
+from drakegrasp.dataset.split import find_homes, split_samples
+from drakegrasp.dataset.successes import judge_successes, shard_successes, successes_of
+from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.environment import available_cores
-from drakegrasp.runtime.files import disk_full_named, new_hdf5, replaced_together, sweep_temporary
+from drakegrasp.runtime.files import (
+    disk_full_named,
+    new_hdf5,
+    read_seal,
+    replaced_together,
+    sweep_temporary,
+)
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.table import Table, join
 from drakegrasp.vision.camera import intrinsics
@@ -130,7 +149,7 @@ def assemble_locked(
     *,
     rejected: Sequence[int | AttemptKey] | None = None,
     known: Mapping[ShardHeader, Table] | None = None,
-    decisions: Decisions | None = None,
+    surveyed: Survey | None = None,
     progress: Report = silent,
 ) -> Assembly:
     """Write the three files and the manifest; the caller holds the lock.
@@ -140,19 +159,15 @@ def assemble_locked(
         manifest: Manifest of the dataset; its filters and split may differ from those on disk.
         rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
         known: The successes of each shard, see `survey`.
-        decisions: What is decided about the successes, if it is decided already.
+        surveyed: The survey of the shards, if there is one already.
         progress: As for `assemble`.
     """
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
         # Decide which successes become samples, and in which split.
-        if decisions is None:
-            surveyed = survey(out, manifest, known, progress=progress)
-            if rejected is not None:
-                keys = keys_of(manifest, surveyed.successes)
-                manifest = replace(manifest, rejected=find_keys(rejected, keys, out))
-            decisions = decide(manifest, surveyed)
-        manifest, surveyed = decisions.manifest, decisions.survey
+        if surveyed is None:
+            surveyed = survey(out, manifest, known, rejected=rejected, progress=progress)
+        manifest, successes = surveyed.manifest, surveyed.successes
 
         # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
@@ -162,16 +177,14 @@ def assemble_locked(
             }
             for camera, file in files.items():
                 file.attrs.update(file_attributes(manifest, surveyed.seals, camera))
-                counts = {split: len(ids) for split, ids in decisions.ids.items()}
+                counts = {split: len(ids) for split, ids in surveyed.samples.items()}
                 for name, count in (counts if camera else {"trials": surveyed.count}).items():
                     group = file.create_group(name)
                     for f in _fields(manifest, DATA_FIELDS if camera else TRIAL_FIELDS):
                         create_field(group, f, f.row_shape(surveyed.sizes), count)
             _write_table(files[""], "objects", OBJECT_FIELDS, object_columns(manifest))
-            ids = surveyed.successes["trial_id"]
-            successes = {"trial_id": ids, "removal": decisions.removal}
             _write_table(files[""], "successes", SUCCESS_FIELDS, successes)
-            _write_rows(out, decisions, files, progress)
+            _write_rows(out, surveyed, files, progress)
 
         # The manifest, with filters, split and rejections, changes together with the files.
         new(FILE_NAME).write_bytes(manifest_text(manifest))
@@ -241,6 +254,210 @@ def _write_table(
         write_field(group, field, columns[field.name])
 
 
+# The survey of the shards
+
+
+@dataclass(frozen=True)
+class ShardRows:
+    """The rows that the dataset takes from a shard: the first ones.
+
+    Attributes:
+        header: Header of the shard.
+        object: Row of the shard's object in /objects.
+        first: Id of the trial in the shard's first row.
+        count: Number of rows taken.
+    """
+
+    header: ShardHeader
+    object: int
+    first: int
+    count: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Survey:
+    """What is known, and decided, of all rows of a dataset before they are written.
+
+    Attributes:
+        manifest: Manifest of the dataset, in which each object that has samples has its split, if
+            whole objects are split.
+        shards: The rows that the dataset takes from each shard, in order.
+        successes: The successes among these rows, with the columns of `successes_of`, the ids of
+            their trials, and `removal`, the `Removal` of each.
+        samples: For each split the ids of the trials that are samples, in rising order.
+        sizes: Lengths of the letters in the shapes of the fields.
+        seals: Hash of the seals of the shards, see `shards_sha256`.
+    """
+
+    manifest: Manifest
+    shards: Sequence[ShardRows]
+    successes: Table
+    samples: Mapping[str, npt.NDArray[np.int64]]
+    sizes: Mapping[str, int]
+    seals: str
+
+    @property
+    def count(self) -> int:
+        """Number of rows of /trials."""
+        return self.shards[-1].first + self.shards[-1].count
+
+
+def survey(
+    out: Path,
+    manifest: Manifest,
+    known: Mapping[ShardHeader, Table] | None = None,
+    *,
+    rejected: Sequence[int | AttemptKey] | None = None,
+    progress: Report = silent,
+) -> Survey:
+    """Survey the shards of a dataset, and decide which successes are samples.
+
+    Args:
+        out: Directory of the dataset.
+        manifest: Its manifest, with filters and split.
+        known: The successes of each shard, as `successes_of` returns them; None: they are read
+            from the shards.
+        rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
+        progress: Called with the number of surveyed shards and twice the number of all.
+
+    Raises:
+        DataError: If a shard is missing or damaged, no object has a palm pose, or a rejected trial
+            is not a success.
+    """
+    headers, letters = list(manifest.headers()), dict[str, int]()
+    numbers = {entry.name: i for i, entry in enumerate(manifest.objects)}
+    shards, tables, first = list[ShardRows](), list[Table](), 0
+    for header in headers:
+        i = numbers[header.object_name]
+        with open_shard(header.path(out), header) as file:
+            # The rows end with the last palm pose that the dataset takes. So a dataset does not
+            # depend on how many more attempts the workers had begun.
+            palms, tried = file["trials/candidate"][:], manifest.objects[i].tried
+            count = len(palms) if tried is None else int(np.count_nonzero(palms < tried))
+            if known is None:
+                successes = successes_of(shard_successes(file), manifest.config)
+            else:
+                successes = known[header]
+            if not letters:
+                letters = sizes_in(file["trials"], TRIAL_FIELDS)
+                letters |= sizes_in(file["looks"], LOOK_FIELDS)
+        successes = successes[successes["trial_id"] < count]
+        own = np.full(successes.count, i, dtype=np.int32)
+        ids = first + successes["trial_id"]
+        tables.append(successes.with_columns(object=own, trial_id=ids))
+        shards.append(ShardRows(header, i, first, count))
+        first += count
+        progress(len(shards), 2 * len(headers))
+    if not shards:
+        raise DataError(f"{out}: no object has a palm pose to try")
+
+    # Decide about the successes.
+    successes, seals = join(tables), shards_sha256(out, manifest)
+    by_key = _ids_by_key(manifest, successes)
+    if rejected is not None:
+        manifest = replace(manifest, rejected=find_keys(rejected, by_key, out))
+    rejected_ids = [by_key[key] for key in manifest.rejected if key in by_key]
+    removal = judge_successes(successes, manifest.config.filters, rejected_ids)
+    manifest, samples = _split(manifest, successes[removal == Removal.KEPT])
+    return Survey(
+        manifest=manifest,
+        shards=shards,
+        successes=successes.with_columns(removal=removal),
+        samples=samples,
+        sizes=letters,
+        seals=seals,
+    )
+
+
+def _ids_by_key(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:
+    """Return the trial id of each success, by the identity of its attempt."""
+    names = ("object", "candidate", "standoff_index", "trial_id")
+    rows = zip(*(successes[name].tolist() for name in names), strict=True)
+    return {AttemptKey(manifest.objects[i].name, *key): t for i, *key, t in rows}
+
+
+def _split(manifest: Manifest, samples: Table) -> tuple[Manifest, dict[str, npt.NDArray[np.int64]]]:
+    """Return the manifest with the splits of its objects, and the trial ids of each split.
+
+    Args:
+        manifest: The manifest; with a split by class, its objects have none.
+        samples: The successes that no filter removes.
+    """
+    config, groups, entries = manifest.config, manifest.groups, manifest.objects
+    homes = manifest.homes()
+    if config.split.by == "object":
+        homes |= find_homes({groups[i] for i in samples["object"].tolist()}, homes, config.split)
+        split = (homes.get(group) for group in groups)
+        objects = tuple(replace(e, split=home) for e, home in zip(entries, split, strict=True))
+        manifest = replace(manifest, objects=objects)
+    rows = split_samples(
+        samples["object"],
+        [entry.name for entry in entries],
+        [entry.class_name for entry in entries],
+        groups,
+        homes,
+        config.split,
+        config.seed,
+    )
+    return manifest, {name: samples["trial_id"][own] for name, own in rows.items()}
+
+
+def shards_sha256(out: Path, manifest: Manifest) -> str:
+    """Return a hash of the seals of all shards that the files are made from, hexadecimal.
+
+    The seals are not verified.
+
+    Raises:
+        DataError: If a shard is missing.
+    """
+    whole = hashlib.sha256()
+    for headers in filter(None, manifest.headers_by_object()):
+        seals = b"".join(read_seal(header.path(out)) for header in headers)
+        whole.update(hashlib.sha256(seals).digest())
+    return whole.hexdigest()
+
+
+def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
+    """Return whether the three files exist and are what assembling would write now.
+
+    Args:
+        out: Directory of the dataset.
+        verify_shards: Whether to compare the shards as well, which opens each of them.
+
+    Raises:
+        DataError: If a file stores values outside of itself, or a shard is missing.
+    """
+    manifest = read_manifest(out)
+    expected = {"signature": manifest.signature()}
+    if verify_shards:
+        expected["shards"] = shards_sha256(out, manifest)
+    try:
+        for name in ASSEMBLED_FILES:
+            with open_hdf5(out / name) as file:
+                if any(str(file.attrs[key]) != value for key, value in expected.items()):
+                    return False
+    except (OSError, KeyError):
+        return False
+    return True
+
+
+def validate_assembled(out: Path) -> None:
+    """Reject a dataset whose files are missing, or of another state than its manifest.
+
+    Raises:
+        DataError: If it is rejected.
+    """
+    if is_assembled(out):
+        return
+    for name in ASSEMBLED_FILES:
+        with open_trials(out / name) if name == TRIALS_FILE else open_samples(out / name):
+            pass  # the mistake of a file is told first
+    raise DataError(
+        f"{out}: files must be those of {FILE_NAME}, got others: `drakegrasp assemble` or the same "
+        "build again writes them"
+    )
+
+
 # Rows
 
 #: A split and a camera.
@@ -261,17 +478,17 @@ class _Samples(NamedTuple):
 
 
 def _write_rows(
-    out: Path, decisions: Decisions, files: Mapping[str, h5py.File], progress: Report
+    out: Path, surveyed: Survey, files: Mapping[str, h5py.File], progress: Report
 ) -> None:
     """Write all rows into their allocated places, from the first to the last.
 
     Args:
         out: Directory of the dataset.
-        decisions: What is decided about the successes.
+        surveyed: The survey of its shards.
         files: For each camera its open data file; for the key "" the file of the trials.
         progress: As for `assemble`.
     """
-    shards, count = decisions.survey.shards, decisions.survey.count
+    shards, count = surveyed.shards, surveyed.count
     firsts = [shard.first for shard in shards]
     written: Counter[Place] = Counter()
     with ThreadPoolExecutor(available_cores()) as pool:
@@ -280,26 +497,26 @@ def _write_rows(
             stop = min(start + BLOCK, count)
             last = bisect_left(firsts, stop)
             own = shards[bisect_right(firsts, start) - 1 : last]
-            trials, samples = _read_block(out, decisions, own, start, stop)
+            trials, samples = _read_block(out, surveyed, own, start, stop)
 
             _write_chunks(files[""]["trials"], trials, start, pool)
-            for place in product(decisions.ids, CAMERAS):
+            for place in product(surveyed.samples, CAMERAS):
                 split, camera = place
                 if parts := samples.get(place):
                     group, first = files[camera][split], written[place]
-                    written[place] += _write_samples(group, parts, first, decisions.manifest)
+                    written[place] += _write_samples(group, parts, first, surveyed.manifest)
             progress(len(shards) + last, 2 * len(shards))
 
 
 def _read_block(
-    out: Path, decisions: Decisions, shards: Sequence[ShardRows], start: int, stop: int
+    out: Path, surveyed: Survey, shards: Sequence[ShardRows], start: int, stop: int
 ) -> tuple[Table, dict[Place, list[_Samples]]]:
     """Return the rows `start` to `stop` - 1 of /trials, and the samples among them.
 
     The seals are not verified here, since the survey has verified them.
     """
     tables, samples = list[Table](), defaultdict[Place, list[_Samples]](list)
-    names = [f.name for f in _fields(decisions.manifest, TRIAL_FIELDS)]
+    names = [f.name for f in _fields(surveyed.manifest, TRIAL_FIELDS)]
     for shard in shards:
         header = shard.header
         with open_shard(header.path(out), header, verify_seal=False) as file:
@@ -313,7 +530,7 @@ def _read_block(
             tables.append(trials[first - shard.first : last - shard.first])
 
             # The samples of these rows, for each camera.
-            for split, ids in decisions.ids.items():
+            for split, ids in surveyed.samples.items():
                 own = ids[slice(*np.searchsorted(ids, (first, last)))]
                 for camera in CAMERAS if len(own) else ():
                     model = _load(model_path(out, header.object_name))

@@ -22,7 +22,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
-from drakegrasp.dataset.assemble import file_attributes, object_columns
+from drakegrasp.dataset.assemble import file_attributes, object_columns, shards_sha256
 from drakegrasp.dataset.hdf5 import (
     DATA_TABLES,
     OF_CAMERA,
@@ -53,7 +53,6 @@ from drakegrasp.dataset.paths import (
 )
 from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, validate_schema_version
 from drakegrasp.dataset.shards import ShardHeader, open_shard
-from drakegrasp.dataset.survey import headers_by_object, known_homes, shards_sha256
 from drakegrasp.dataset.trials import Stamp, Trials, reopened, stamp
 from drakegrasp.errors import DataError, DrakegraspError, MeshError, first_line, printable
 from drakegrasp.filters import Removal
@@ -206,7 +205,7 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     manifest, looks = read_manifest(out), dict[str, _Look]()
     found, other, seals = check_hand(manifest), list[Violation](), ""
     with _reported(found, FILE_NAME, "objects of one group must be in one split"):
-        known_homes(manifest)
+        manifest.homes()
 
     # Headers, and the state that each file is of. A missing shard is found with its object.
     with suppress(DataError):
@@ -227,7 +226,7 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     known = {} if trials is None or trials.found or other else trials.counts
     tasks: list[Task] = [
         partial(_check_object, out, entry, headers)
-        for entry, headers in zip(manifest.objects, headers_by_object(manifest), strict=True)
+        for entry, headers in zip(manifest.objects, manifest.headers_by_object(), strict=True)
     ]
     for name, look in looks.items():
         compared = bool(known) and name in cameras and not look.found

@@ -206,6 +206,13 @@ class Manifest:
                     stop=unit.stop,
                 )
 
+    def headers_by_object(self) -> list[tuple[ShardHeader, ...]]:
+        """Return the work units of each object."""
+        by_name: dict[str, list[ShardHeader]] = {entry.name: [] for entry in self.objects}
+        for header in self.headers():
+            by_name[header.object_name].append(header)
+        return [tuple(headers) for headers in by_name.values()]
+
     @property
     def units(self) -> int:
         """Number of work units."""
@@ -215,6 +222,24 @@ class Manifest:
     def groups(self) -> list[str]:
         """Group of each object, equal for variants of the same mesh."""
         return [entry.group or entry.name for entry in self.objects]
+
+    def homes(self) -> dict[str, Home]:
+        """Return the split of each group that was in one before; none if the split is by class.
+
+        Raises:
+            DataError: If objects of a group were in two splits.
+        """
+        homes, first = dict[str, Home](), dict[str, str]()
+        for group, entry in zip(self.groups, self.objects, strict=True):
+            if entry.split is None or self.config.split.by == "class":
+                continue
+            if homes.setdefault(group, entry.split) != entry.split:
+                raise DataError(
+                    f"{first[group]} and {entry.name} must be in one split to be of one group "
+                    f"({group}), got them in {homes[group]} and {entry.split}"
+                )
+            first.setdefault(group, entry.name)
+        return homes
 
     def signature(self) -> str:
         """Return a hash of everything that determines a row of the dataset, hexadecimal."""

@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, open_samples, open_trials
-from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import ASSEMBLED_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.assemble import validate_assembled
+from drakegrasp.dataset.hdf5 import AnyArray
+from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.dataset.survey import shards_sha256
 from drakegrasp.dataset.trials import NONE, Trials
-from drakegrasp.errors import DataError, counted
+from drakegrasp.errors import counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.grasp import BANDS, approach_cells, distinct_grasps, elevation_bands
@@ -74,47 +73,6 @@ class SplitCount:
     distinct: int
     objects: int
     classes: int
-
-
-def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
-    """Return whether the three files exist and are what assembling would write now.
-
-    Args:
-        out: Directory of the dataset.
-        verify_shards: Whether to compare the shards as well, which opens each of them.
-
-    Raises:
-        DataError: If a file stores values outside of itself, or a shard is missing.
-    """
-    manifest = read_manifest(out)
-    expected = {"signature": manifest.signature()}
-    if verify_shards:
-        expected["shards"] = shards_sha256(out, manifest)
-    try:
-        for name in ASSEMBLED_FILES:
-            with open_hdf5(out / name) as file:
-                if any(str(file.attrs[key]) != value for key, value in expected.items()):
-                    return False
-    except (OSError, KeyError):
-        return False
-    return True
-
-
-def validate_assembled(out: Path) -> None:
-    """Reject a dataset whose files are missing, or of another state than its manifest.
-
-    Raises:
-        DataError: If it is rejected.
-    """
-    if is_assembled(out):
-        return
-    for name in ASSEMBLED_FILES:
-        with open_trials(out / name) if name == TRIALS_FILE else open_samples(out / name):
-            pass  # the mistake of a file is told first
-    raise DataError(
-        f"{out}: files must be those of {FILE_NAME}, got others: `drakegrasp assemble` or the same "
-        "build again writes them"
-    )
 
 
 def palms_in_files(out: Path) -> dict[str, int]:

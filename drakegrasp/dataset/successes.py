@@ -1,16 +1,16 @@
 """Successes: what filters and splits need of each grasp that held, and why it is no sample.
 
 Input: rows of `/trials` and `/looks`. Output: a table with the identity of each attempt, columns of
-its rows, and the columns below, each of which one function derives; a column whose sources are
-missing is left out. From it follows the `Removal` of each: by our filters, user-defined filters,
-outliers and rejections.
+its rows, and columns that follow from them. From it follows the `Removal` of each: by our filters,
+user-defined filters, outliers and rejections.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -18,191 +18,37 @@ from drakegrasp import registry
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CameraConfig, Config, FilterConfig, is_own_class
 from drakegrasp.dataset import quality
-from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.schema import CAMERAS, with_derived
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns
+from drakegrasp.dataset.schema import CAMERAS, LOOK_FIELDS, TRIAL_FIELDS, with_derived
 from drakegrasp.errors import ConfigError, listed
-from drakegrasp.filters import NEEDED, Filter, Flags, Removal, first_removal, is_outlier
+from drakegrasp.filters import Filter, Flags, Removal, first_removal, is_outlier
 from drakegrasp.frames import Array, invert_pose, unpack_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.registry import own_class, run_own
 from drakegrasp.table import Table
 from drakegrasp.vision.camera import intrinsics, project
 
-_UNUSED = ("unused", "closed_touching")
-_GRASP = ("X_TO", "closed_p_OQ", "closed_nhat_Q_O")
-_HELD = ("lifted_p_OQ", "lifted_nhat_Q_O")
+#: Columns of `/trials` that are copied: the identity of the attempt, and values of filters.
+COPIED = ("candidate", "standoff_index", "resting", "slip", "turn", "slip_use")
+#: Columns of `/trials` and of `/looks` that `successes_of` reads.
+_OF_TRIALS = (
+    *COPIED,
+    *("X_TO", "X_OG", "closed_p_OQ", "closed_nhat_Q_O", "lifted_p_OQ", "lifted_nhat_Q_O"),
+    *("closed_touching", "lifted_touching", *quality.COLUMNS),
+)
 _POSES = tuple(f"X_TC_{camera}" for camera in CAMERAS)
 _MASKS = tuple(f"mask_{camera}" for camera in CAMERAS)
 
 
-class Derived(NamedTuple):
-    """A column: the columns that it needs, and the function that derives it from these rows."""
+def shard_successes(file: h5py.File) -> Table:
+    """Return the columns of a shard's successes from which those of `successes_of` follow.
 
-    needs: tuple[str, ...]
-    of: Callable[[Table, CameraConfig], AnyArray]
-
-
-#: The derived columns by their names, which are those of the functions below.
-DERIVED: dict[str, Derived] = {}
-
-_Function = Callable[[Table, CameraConfig], AnyArray]
-
-
-def _derived(*needs: str) -> Callable[[_Function], _Function]:
-    """Enter a function into DERIVED, with the columns of `/trials` and `/looks` that it needs."""
-
-    def enter(function: _Function) -> _Function:
-        DERIVED[function.__name__] = Derived(needs, function)
-        return function
-
-    return enter
-
-
-@_derived(*_UNUSED)
-def unused(t: Table, camera: CameraConfig) -> Flags:
-    """Return the fingers (n, k) that the preshape leaves out."""
-    return unused_fingers(t["unused"], t["closed_touching"].shape[1])
-
-
-@_derived(*_UNUSED, "lifted_touching")
-def complete(t: Table, camera: CameraConfig) -> Flags:
-    """Return whether all used fingers touch after closing and after the lift, (n,)."""
-    touching = t["closed_touching"] & t["lifted_touching"]
-    return np.all(touching | unused(t, camera), axis=1)
-
-
-@_derived(*_GRASP)
-def grasp_T(t: Table, camera: CameraConfig) -> Array:
-    """Return the grasps (n, 6k) in {T}."""
-    X_TO = unpack_pose(t["X_TO"])
-    nhat_Q_T = multiply(t["closed_nhat_Q_O"], np.swapaxes(X_TO[:, :3, :3], 1, 2))
-    return _packed(_points(X_TO, t["closed_p_OQ"]), nhat_Q_T)
-
-
-def _points(X_AB: Array, p_BQ: Array) -> Array:
-    """Return points p_AQ (n, k, 3) of p_BQ (n, k, 3) [m] under poses (n, 4, 4)."""
-    return multiply(p_BQ, np.swapaxes(X_AB[:, :3, :3], 1, 2)) + X_AB[:, None, :3, 3]
-
-
-@_derived(*_HELD)
-def held_O(t: Table, camera: CameraConfig) -> Array:
-    """Return the contacts (n, 6k) in {O} at the end of the lift."""
-    return _packed(*(t[name] for name in _HELD))
-
-
-def _packed(points: Array, normals: Array) -> Array:
-    """Return grasp vectors (n, 6k) of points and normals (n, k, 3)."""
-    vectors = np.concatenate([points, normals], axis=1)
-    return vectors.reshape(len(vectors), 3 * vectors.shape[1])
-
-
-@_derived("lifted_other_links")
-def other_links(t: Table, camera: CameraConfig) -> AnyArray:
-    """Return the number of links (n,) besides fingertips that touch the object after the lift."""
-    return t["lifted_other_links"]
-
-
-@_derived(*_MASKS)
-def seen(t: Table, camera: CameraConfig) -> Flags:
-    """Return whether both masks have a pixel of the object, (n,)."""
-    return np.all([t[name].any(axis=(1, 2)) for name in _MASKS], axis=0)
-
-
-@_derived(*_GRASP, *_UNUSED, *_POSES)
-def in_view(t: Table, camera: CameraConfig) -> Flags:
-    """Return whether both cameras see all contacts of used fingers, (n,)."""
-    X_TO = unpack_pose(t["X_TO"])
-    p_TQ = _points(X_TO, t["closed_p_OQ"])
-    every = np.ones(p_TQ.shape[:2], dtype=np.bool_)
-    for name in _POSES:
-        X_CT = invert_pose(unpack_pose(t[name]))
-        every &= in_image(intrinsics(camera), camera.size, _points(X_CT, p_TQ))
-    return np.all(every | unused(t, camera), axis=1)
-
-
-def in_image(K: Array, size: int, p_CQ: Array) -> Flags:
-    """Return which points (..., 3) [m] are in front of a camera and within its image [px]."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        uv = project(K, p_CQ.reshape(-1, 3)).reshape(*p_CQ.shape[:-1], 2)
-        inside = np.all((uv >= 0.0) & (uv <= size - 1), axis=-1)
-        return np.asarray(inside & (p_CQ[..., 2] > 0.0))
-
-
-@_derived("X_TC_otm")
-def camera_height(t: Table, camera: CameraConfig) -> Array:
-    """Return the height (n,) of the cameras, which are at the same point, above the table [m]."""
-    return np.asarray(unpack_pose(t["X_TC_otm"])[:, 2, 3])
-
-
-@_derived("depth_otm")
-def depth_variance(t: Table, camera: CameraConfig) -> Array:
-    """Return the variance (n,) of the otm depth images [m^2]."""
-    return np.asarray(t["depth_otm"].astype(float).var(axis=(1, 2)))
-
-
-@_derived("surface_distance", *_UNUSED)
-def surface_distance(t: Table, camera: CameraConfig) -> Array:
-    """Return the largest distance (n,) of a used finger's contact from the surface [m]."""
-    return np.where(unused(t, camera), 0.0, t["surface_distance"]).max(axis=1, initial=0.0)
-
-
-@_derived("normal_angle", *_UNUSED)
-def normal_angle(t: Table, camera: CameraConfig) -> Array:
-    """Return the largest angle (n,) of a used finger's normal from that of the surface [rad]."""
-    return np.where(unused(t, camera), 0.0, t["normal_angle"]).max(axis=1, initial=0.0)
-
-
-@_derived(*quality.COLUMNS)
-def anomaly(t: Table, camera: CameraConfig) -> Array:
-    """Return the score (n,) of `quality.anomaly`."""
-    return quality.anomaly(t).score
-
-
-@_derived(*quality.COLUMNS)
-def penetration(t: Table, camera: CameraConfig) -> Array:
-    """Return the largest depth (n,) of the object in a fingertip [m]."""
-    return quality.anomaly(t).values["penetration"]
-
-
-@_derived(*quality.COLUMNS)
-def imbalance(t: Table, camera: CameraConfig) -> Array:
-    """Return the imbalance (n,) of the fingertips' forces, as a fraction of the weight."""
-    return quality.anomaly(t).values["imbalance"]
-
-
-@_derived(*quality.COLUMNS)
-def normal_sum(t: Table, camera: CameraConfig) -> Array:
-    """Return the length (n,) of the sum of the contact normals, per finger."""
-    return quality.anomaly(t).values["normal_sum"]
-
-
-@_derived("X_OG")
-def X_OG(t: Table, camera: CameraConfig) -> Array:
-    """Return the poses (n, 4, 4) of the palm in {O}."""
-    return unpack_pose(t["X_OG"])
-
-
-#: Columns that are copied: the identity of the attempt, and what the filters need besides.
-COPIED = tuple(
-    name
-    for name in (
-        "candidate",
-        "standoff_index",
-        "resting",
-        *dict.fromkeys(("slip", "turn", *NEEDED)),
-    )
-    if name not in DERIVED
-)
-#: Columns of `/looks` and of `/trials` from which the columns of successes follow; `depth_otm` is
-#: the depth in `image_otm`.
-LOOK_COLUMNS = (*_MASKS, *_POSES)
-TRIAL_COLUMNS = tuple(
-    name
-    for name in dict.fromkeys(
-        (*COPIED, *(need for each in DERIVED.values() for need in each.needs))
-    )
-    if name not in (*LOOK_COLUMNS, "depth_otm")
-)
+    `row` is each success's row of the shard's /trials.
+    """
+    looks = read_columns(file["looks"], LOOK_FIELDS, ("row", *_POSES, *_MASKS))
+    trials = read_columns(file["trials"], TRIAL_FIELDS, dict.fromkeys(_OF_TRIALS))[looks["row"]]
+    depth = file["looks/image_otm"][:, 3] if trials.count else np.zeros((0, 1, 1))
+    return trials.with_columns(looks, depth_otm=depth)
 
 
 def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
@@ -213,15 +59,75 @@ def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
 
     Args:
         rows: Columns of the successes' rows of `/trials` and `/looks`, by their names there;
-            `depth_otm` (n, S, S) are their otm depth images [m].
+            `depth_otm` (n, S, S) are their otm depth images [m]. If the poses of the cameras or the
+            images are missing, the columns that follow from them are, too.
         config: Configuration, whose camera and limits of filters are used.
     """
     t = Table(with_derived(rows))
-    derived = {n: d.of(t, config.camera) for n, d in DERIVED.items() if t.has(*d.needs)}
-    successes = t.only(*COPIED).with_columns(derived, object=np.zeros(t.count, dtype=np.int32))
+    unused = unused_fingers(t["unused"], t["closed_touching"].shape[1])
+    touching = t["closed_touching"] & t["lifted_touching"]
+    anomaly = quality.anomaly(t)
+
+    # The grasp in {T}.
+    X_TO = unpack_pose(t["X_TO"])
+    p_TQ = _points(X_TO, t["closed_p_OQ"])
+    nhat_Q_T = multiply(t["closed_nhat_Q_O"], np.swapaxes(X_TO[:, :3, :3], 1, 2))
+
+    successes = t.only(*COPIED).with_columns(
+        {name: anomaly.values[name] for name in ("penetration", "imbalance", "normal_sum")},
+        object=np.zeros(t.count, dtype=np.int32),
+        X_OG=unpack_pose(t["X_OG"]),
+        unused=unused,
+        complete=np.all(touching | unused, axis=1),
+        grasp_T=_packed(p_TQ, nhat_Q_T),
+        held_O=_packed(t["lifted_p_OQ"], t["lifted_nhat_Q_O"]),
+        other_links=t["lifted_other_links"],
+        surface_distance=_largest(t["surface_distance"], unused),
+        normal_angle=_largest(t["normal_angle"], unused),
+        anomaly=anomaly.score,
+    )
+    if t.has(*_POSES):
+        in_view = unused | _in_view(t, p_TQ, config.camera)
+        height = unpack_pose(t["X_TC_otm"])[:, 2, 3]  # both cameras are at the same point
+        successes = successes.with_columns(in_view=in_view.all(axis=1), camera_height=height)
+    if t.has(*_MASKS):
+        seen = np.all([t[name].any(axis=(1, 2)) for name in _MASKS], axis=0)
+        variance = t["depth_otm"].astype(float).var(axis=(1, 2))
+        successes = successes.with_columns(seen=seen, depth_variance=variance)
     if t.has("row"):
         successes = successes.with_columns(trial_id=t["row"].astype(np.int64))
     return successes.with_columns(by_filter=first_removal(successes, config.filters))
+
+
+def _points(X_AB: Array, p_BQ: Array) -> Array:
+    """Return points p_AQ (n, k, 3) of p_BQ (n, k, 3) [m] under poses (n, 4, 4)."""
+    return multiply(p_BQ, np.swapaxes(X_AB[:, :3, :3], 1, 2)) + X_AB[:, None, :3, 3]
+
+
+def _packed(points: Array, normals: Array) -> Array:
+    """Return grasp vectors (n, 6k) of points and normals (n, k, 3)."""
+    vectors = np.concatenate([points, normals], axis=1)
+    return vectors.reshape(len(vectors), 3 * vectors.shape[1])
+
+
+def _largest(values: Array, unused: Flags) -> Array:
+    """Return the largest value (n,) of a used finger, of values (n, k) that are not negative."""
+    return np.where(unused, 0.0, values).max(axis=1, initial=0.0)
+
+
+def _in_view(t: Table, p_TQ: Array, camera: CameraConfig) -> Flags:
+    """Return which points (n, k) both cameras see, given p_TQ (n, k, 3) [m]."""
+    X_CT = [invert_pose(unpack_pose(t[name])) for name in _POSES]
+    seen = [in_image(intrinsics(camera), camera.size, _points(X, p_TQ)) for X in X_CT]
+    return np.all(seen, axis=0)
+
+
+def in_image(K: Array, size: int, p_CQ: Array) -> Flags:
+    """Return which points (..., 3) [m] are in front of a camera and within its image [px]."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        uv = project(K, p_CQ.reshape(-1, 3)).reshape(*p_CQ.shape[:-1], 2)
+        inside = np.all((uv >= 0.0) & (uv <= size - 1), axis=-1)
+        return np.asarray(inside & (p_CQ[..., 2] > 0.0))
 
 
 # Removals

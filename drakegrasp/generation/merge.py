@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 
 from drakegrasp.config import CarriedHand, Config
-from drakegrasp.dataset.assemble import Assembly, assemble_locked
+from drakegrasp.dataset.assemble import Assembly, assemble_locked, is_assembled
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -26,7 +26,6 @@ from drakegrasp.dataset.manifest import (
     write_manifest,
 )
 from drakegrasp.dataset.paths import object_files
-from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import DataError
 from drakegrasp.hand.folder import carry_hand

@@ -17,7 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
+from drakegrasp.dataset.assemble import (
+    Assembly,
+    Survey,
+    assemble_locked,
+    is_assembled,
+    summarise,
+    survey,
+)
 from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
@@ -27,8 +34,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.prepared_objects import with_drawn
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.statistics import is_assembled, palms_in_files
-from drakegrasp.dataset.survey import Decisions, decide, headers_by_object, known_homes, survey
+from drakegrasp.dataset.statistics import palms_in_files
 from drakegrasp.errors import (
     DataError,
     GraspError,
@@ -230,11 +236,11 @@ class _Build:
         self._postures = postures
 
         # With a target: the palm poses that the dataset had of each object, the grasps that are no
-        # samples by inspection, the successes of each completed unit, and what is decided of them.
+        # samples by inspection, the successes of each completed unit, and the survey of them all.
         self._floors: dict[str, int] = {}
         self._rejected = set[tuple[str, int, int]]()
         self._successes: dict[ShardHeader, Table] = {}
-        self._decisions: Decisions | None = None
+        self._survey: Survey | None = None
 
     def run(self, sources: Sequence[MeshSource]) -> BuildReport:
         """Prepare, simulate, assemble."""
@@ -330,7 +336,7 @@ class _Build:
             refused=tuple(refused),
             rejected=tuple(key for key in manifest.rejected if key.object in same),
         )
-        known_homes(self._manifest)  # raises an error for a group in two splits
+        self._manifest.homes()  # raises an error for a group in two splits
         write_manifest(self._manifest, self._out)
 
     def _entries(
@@ -439,9 +445,9 @@ class _Build:
             return {}
         if not manifest.units:
             return {}
-        self._decisions = decide(manifest, survey(self._out, manifest, self._successes))
-        objects = self._decisions.survey.successes["object"]
-        lost = objects[self._decisions.removal == Removal.OUTLIER]
+        self._survey = survey(self._out, manifest, self._successes)
+        successes = self._survey.successes
+        lost = successes["object"][successes["removal"] == Removal.OUTLIER]
         counts = np.bincount(lost, minlength=len(names))
         return dict(zip(names, counts.tolist(), strict=True))
 
@@ -485,9 +491,9 @@ class _Build:
         stale = not is_assembled(out, verify_shards=True)
         if stale:
             with self._progress("assemble", "shards") as report:
-                known, decisions = self._successes or None, self._decisions
+                known, surveyed = self._successes or None, self._survey
                 assemble_locked(
-                    out, self._manifest, known=known, decisions=decisions, progress=report
+                    out, self._manifest, known=known, surveyed=surveyed, progress=report
                 )
         return stale
 
@@ -495,7 +501,7 @@ class _Build:
 def _set_units(target: Target, manifest: Manifest) -> None:
     """State the work units of each object, but no part of a unit that may still grow."""
     most = manifest.config.candidates.max
-    for entry, headers in zip(manifest.objects, headers_by_object(manifest), strict=True):
+    for entry, headers in zip(manifest.objects, manifest.headers_by_object(), strict=True):
         endless = not entry.ended and entry.candidates < most
         whole = {unit.stop for unit in manifest.config.unit_ranges(most)}
         units = [h for h in headers if not endless or h.stop in whole]

@@ -43,7 +43,6 @@ from drakegrasp.dataset.schema import (
     stored_fields,
 )
 from drakegrasp.dataset.split import home_by_rank, may_train, rank_in_split
-from drakegrasp.dataset.survey import known_homes
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
@@ -193,7 +192,7 @@ def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
     """
     config, seed = manifest.config.split, manifest.config.seed
     if config.by == "object":
-        homes = known_homes(manifest)
+        homes = manifest.homes()
         return [SPLITS.index(homes.get(g) or home_by_rank(g, config)) for g in manifest.groups]
     train, valid, test = range(len(SPLITS))
     groups = manifest.groups

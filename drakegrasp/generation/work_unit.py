@@ -23,8 +23,7 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import object_files, shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, ROBUST_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, write_shard
-from drakegrasp.dataset.successes import find_hits, successes_of
-from drakegrasp.dataset.survey import headers_by_object, shard_successes
+from drakegrasp.dataset.successes import find_hits, shard_successes, successes_of
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import (
@@ -334,7 +333,7 @@ def find_tasks(out: Path, manifest: Manifest) -> Iterator[tuple[ShardHeader, ...
         folders = set(os.listdir(out / "shards"))
     except FileNotFoundError:
         return
-    for headers in filter(None, headers_by_object(manifest)):
+    for headers in filter(None, manifest.headers_by_object()):
         if shards_folder(out, headers[0].object_name).name in folders:
             yield headers
 

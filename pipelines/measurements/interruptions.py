@@ -33,8 +33,8 @@ import numpy as np
 import psutil
 import trimesh
 
+from drakegrasp.dataset.assemble import is_assembled
 from drakegrasp.dataset.lock import tidy
-from drakegrasp.dataset.statistics import is_assembled
 
 DATA = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
 PAGE, ROOM = 4096, 2**31

@@ -17,8 +17,8 @@ from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 from helpers.shards import read_shard
 
 from drakegrasp.dataset import assemble as module
-from drakegrasp.dataset import hdf5, shards, survey
-from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset import hdf5, shards
+from drakegrasp.dataset.assemble import assemble, survey
 from drakegrasp.dataset.manifest import read_manifest, with_postprocessing
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.dataset.successes import in_image
@@ -182,8 +182,7 @@ def removed(sound: Path) -> Callable[..., Counter[Removal]]:
 
     def count(*overrides: str) -> Counter[Removal]:
         manifest = with_postprocessing(read_manifest(sound), overrides)
-        decisions = survey.decide(manifest, survey.survey(sound, manifest))
-        return Counter(map(Removal, decisions.removal.tolist()))
+        return Counter(map(Removal, survey(sound, manifest).successes["removal"].tolist()))
 
     return count
 
@@ -317,9 +316,8 @@ def test_full_disk_is_one_line_wherever_it_fills(out: Path) -> None:
 KILL = """
 import os, signal, sys, time
 from pathlib import Path
-from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.assemble import assemble, is_assembled
 from drakegrasp.dataset.lock import tidy
-from drakegrasp.dataset.statistics import is_assembled
 
 out, kills = Path(sys.argv[1]), 0
 settings = [f"filters.max_slip={sys.argv[2]}", "filters.max_slip=1"]
