@@ -17,7 +17,7 @@ plant. Sampled output ports report the contacts of the previous step.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -216,7 +216,10 @@ def _build(
     )
     drawn |= _add_hand(plant, scene_graph, hand, own_motors)
     instance, fingertips = drawn["instance"], drawn["fingertips"]
-    _make_compliant_hand(plant, scene_graph, instance, fingertips, physics)
+    tips, friction = {body.index() for body in fingertips}, physics.friction_hand
+    for index in plant.GetBodyIndices(instance):
+        modulus = physics.fingertip_modulus if index in tips else physics.link_modulus
+        _make_compliant(plant, scene_graph, plant.get_body(index), modulus, friction, physics)
     plant.Finalize()
 
     # Add what needs the finalized plant: collision filters and the wrist's input.
@@ -326,32 +329,29 @@ def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsC
     (instance,) = make_parser(plant).AddModels(MODELS / "table.urdf")
     body = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
-    properties = ProximityProperties()
-    AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
-    properties.AddProperty("hydroelastic", "margin", TABLE_MARGIN)
-    _add_material(properties, partner_friction(physics.friction_table, physics), physics)
-    _assign_proximity(plant, scene_graph, body, properties)
+    modulus, friction = physics.table_modulus, physics.friction_table
+    _make_compliant(plant, scene_graph, body, modulus, friction, physics, margin=TABLE_MARGIN)
     return body
 
 
-def object_friction(physics: PhysicsConfig) -> float:
+def object_friction(rules: PhysicsConfig | Materials) -> float:
     """Return the object's own friction coefficient.
 
     Drake combines the coefficients a, b of a pair to 2 a b / (a + b). If the object has the larger
     of the two effective values, each effective value results from a positive coefficient of the
     partner.
     """
-    return max(physics.friction_hand, physics.friction_table)
+    return max(rules.friction_hand, rules.friction_table)
 
 
-def partner_friction(effective: float, physics: PhysicsConfig) -> float:
+def partner_friction(effective: float, rules: PhysicsConfig | Materials) -> float:
     """Return the coefficient of hand or table that results in an effective one with the object.
 
     With the object's own coefficient a, Drake's rule is solved for the partner's coefficient b:
 
         μ = 2 a b / (a + b)   ⇔   b = μ a / (2 a − μ)
     """
-    mu = object_friction(physics)
+    mu = object_friction(rules)
     return effective * mu / (2.0 * mu - effective)
 
 
@@ -363,12 +363,22 @@ def _add_material(properties: ProximityProperties, mu: float, physics: PhysicsCo
     )
 
 
-def _assign_proximity(
+def _make_compliant(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     body: RigidBody,
-    properties: ProximityProperties,
+    modulus: float,
+    effective: float,
+    physics: PhysicsConfig,
+    *,
+    margin: float | None = None,
 ) -> None:
+    """Give a body a stiffness [Pa], its effective friction with the object, and a margin [m]."""
+    properties = ProximityProperties()
+    AddCompliantHydroelasticProperties(RESOLUTION_HINT, modulus, properties)
+    if margin is not None:
+        properties.AddProperty("hydroelastic", "margin", margin)
+    _add_material(properties, partner_friction(effective, physics), physics)
     for geometry in plant.GetCollisionGeometriesForBody(body):
         scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
@@ -548,24 +558,6 @@ def _of_motors(
     }
 
 
-def _make_compliant_hand(
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    instance: ModelInstanceIndex,
-    fingertips: Sequence[RigidBody],
-    physics: PhysicsConfig,
-) -> None:
-    """Give each link the stiffness of a fingertip or of another link, and the hand's friction."""
-    tips = {body.index() for body in fingertips}
-    mu = partner_friction(physics.friction_hand, physics)
-    for index in plant.GetBodyIndices(instance):
-        modulus = physics.fingertip_modulus if index in tips else physics.link_modulus
-        properties = ProximityProperties()
-        AddCompliantHydroelasticProperties(RESOLUTION_HINT, modulus, properties)
-        _add_material(properties, mu, physics)
-        _assign_proximity(plant, scene_graph, plant.get_body(index), properties)
-
-
 def _part_surfaces(
     plant: MultibodyPlant,
     manager: CollisionFilterManager,
@@ -609,9 +601,6 @@ def _filter_within_hand(
         manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(tip)))
 
 
-# Friction and mass of an existing scene
-
-
 def set_materials(scene: Scene, materials: Materials) -> None:
     """Set the friction and mass of a scene to those of an attempt, unless it already has them.
 
@@ -622,66 +611,21 @@ def set_materials(scene: Scene, materials: Materials) -> None:
     if scene.object.get_mass(scene.context) != materials.mass:
         inertia = object_inertia(scene.model, materials.mass)
         scene.object.SetSpatialInertiaInBodyFrame(scene.context, inertia)
-    for geometry, mu in list(_coefficients(scene, materials)):
-        _set_friction(scene, geometry, mu)
+    _set_friction(scene, scene.object, object_friction(materials))
+    _set_friction(scene, scene.table, partner_friction(materials.friction_table, materials))
+    for link in scene.links:
+        _set_friction(scene, link, partner_friction(materials.friction_hand, materials))
 
 
-def copy_materials(scene: Scene, before: Scene) -> None:
-    """Copy the friction and mass of another scene of the same object and hand."""
-    if scene.object.get_mass(scene.context) != before.object.get_mass(before.context):
-        inertia = before.object.CalcSpatialInertiaInBodyFrame(before.context)
-        scene.object.SetSpatialInertiaInBodyFrame(scene.context, inertia)
-    for geometry, other in zip(_geometries(scene), _geometries(before), strict=True):
-        _set_friction(scene, geometry, _friction(before, other))
-
-
-def _set_friction(scene: Scene, geometry: GeometryId, mu: float) -> None:
-    """Set a shape's own coefficient of friction, if it has another one."""
-    # Assigning properties recomputes the shape's hydroelastic representation, which takes time.
-    if _friction(scene, geometry) == mu:
-        return
-    properties = ProximityProperties(_properties(scene, geometry))
-    properties.UpdateProperty(*FRICTION, CoulombFriction(mu, mu))
-    scene.scene_graph.AssignRole(
-        scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context()),
-        scene.plant.get_source_id(),
-        geometry,
-        properties,
-        RoleAssign.kReplace,
-    )
-
-
-def _friction(scene: Scene, geometry: GeometryId) -> float:
-    return float(_properties(scene, geometry).GetProperty(*FRICTION).dynamic_friction())
-
-
-def _properties(scene: Scene, geometry: GeometryId) -> ProximityProperties:
-    return scene.plant.EvalSceneGraphInspector(scene.context).GetProximityProperties(geometry)
-
-
-def _coefficients(scene: Scene, materials: Materials) -> Iterator[tuple[GeometryId, float]]:
-    """Yield each shape with its own coefficient of friction."""
-    physics = scene.physics.model_copy(
-        update={
-            "friction_hand": materials.friction_hand,
-            "friction_table": materials.friction_table,
-        }
-    )
-    hand = partner_friction(physics.friction_hand, physics)
-    own = {
-        scene.object.index(): object_friction(physics),
-        scene.table.index(): partner_friction(physics.friction_table, physics),
-    }
-    for body in _bodies(scene):
-        for geometry in scene.plant.GetCollisionGeometriesForBody(body):
-            yield geometry, own.get(body.index(), hand)
-
-
-def _geometries(scene: Scene) -> list[GeometryId]:
-    geometries = scene.plant.GetCollisionGeometriesForBody
-    return [geometry for body in _bodies(scene) for geometry in geometries(body)]
-
-
-def _bodies(scene: Scene) -> list[RigidBody]:
-    """Return object, table and the links of the hand."""
-    return [scene.object, scene.table, *scene.links]
+def _set_friction(scene: Scene, body: RigidBody, mu: float) -> None:
+    """Set the own coefficient of friction of each shape of a body, if it has another one."""
+    source = scene.plant.get_source_id()
+    for geometry in scene.plant.GetCollisionGeometriesForBody(body):
+        inspector = scene.plant.EvalSceneGraphInspector(scene.context)
+        properties = ProximityProperties(inspector.GetProximityProperties(geometry))
+        # Assigning properties recomputes the shape's hydroelastic representation, which takes time.
+        if properties.GetProperty(*FRICTION).dynamic_friction() != mu:
+            properties.UpdateProperty(*FRICTION, CoulombFriction(mu, mu))
+            scene.scene_graph.AssignRole(
+                scene.graph_context, source, geometry, properties, RoleAssign.kReplace
+            )

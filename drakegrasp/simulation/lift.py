@@ -25,7 +25,8 @@ from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config, LiftConfig
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
 from drakegrasp.hand.finger_sweep import pad_points
-from drakegrasp.simulation.construction import copy_materials
+from drakegrasp.simulation.attempt import Materials
+from drakegrasp.simulation.construction import set_materials
 from drakegrasp.simulation.contacts import (
     ClearanceMonitor,
     Contacts,
@@ -89,13 +90,14 @@ class Lift:
     clearance: float = np.nan
 
 
-def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
+def lift(scene: Scene, limits: TrialLimits, config: Config, materials: Materials) -> Lift:
     """Free the object, move the wrist to `lift.p_TG`, hold it there, and return the result.
 
     Args:
         scene: Scene with the object in the closed hand.
         limits: The attempt's limits.
         config: The rules.
+        materials: Friction and mass of the attempt.
 
     Raises:
         TrialTimeout: See `TrialLimits.advance`.
@@ -139,7 +141,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
                 chosen = _scene_for(scene, monitor.at_rest)
                 if chosen is not current:
                     used.append(chosen)
-                    copy_materials(chosen, current)
+                    set_materials(chosen, materials)
                     transfer_state(chosen, current, now, motion)
                     hand_over(chosen, current)
                 current = chosen

@@ -99,6 +99,12 @@ class ObjectScene:
         return self.plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
 
     @property
+    def graph_context(self) -> Context:
+        """The context of the scene graph."""
+        root = self.simulator.get_mutable_context()
+        return self.scene_graph.GetMyMutableContextFromRoot(root)
+
+    @property
     def time(self) -> float:
         """Simulated time since the last reset [s]."""
         return float(self.simulator.get_context().get_time())
@@ -259,9 +265,7 @@ def _let_object_meet_table(scene: ObjectScene, meet: bool) -> None:
     While both are static, such a contact changes nothing, but computing it at each step would cost
     more than everything else before a finger touches.
     """
-    manager = scene.scene_graph.collision_filter_manager(
-        scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context())
-    )
+    manager = scene.scene_graph.collision_filter_manager(scene.graph_context)
     declare = CollisionFilterDeclaration()
     sides = (
         GeometrySet(scene.table_side),

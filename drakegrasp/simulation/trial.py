@@ -190,7 +190,7 @@ def run_attempt(
         record = _close(scene, start, attempt, config, limits, prediction)
         if record.outcome is not Outcome.SUCCESS:
             return record
-        return _lift(scene, record, config, limits)
+        return _lift(scene, record, config, limits, _materials(scene, attempt))
     except TrialTimeout:
         return replace(start, outcome=Outcome.TIMEOUT)
     except (MemoryError, OSError):
@@ -292,9 +292,11 @@ def _close(
     return replace(start, closed=closed, outcome=verdict)
 
 
-def _lift(scene: Scene, record: TrialRecord, config: Config, limits: TrialLimits) -> TrialRecord:
+def _lift(
+    scene: Scene, record: TrialRecord, config: Config, limits: TrialLimits, materials: Materials
+) -> TrialRecord:
     """Lift the object in the closed hand, and return the record."""
-    end = lift(scene, limits, config)
+    end = lift(scene, limits, config, materials)
     # A lift that ended because the object moved has no verdict on what the hand holds.
     if end.moved:
         return replace(record, lift=end, outcome=Outcome.MOVED)
