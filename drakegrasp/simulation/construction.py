@@ -29,7 +29,6 @@ from pydrake.geometry import (
     AddContactMaterial,
     AddRigidHydroelasticProperties,
     CollisionFilterDeclaration,
-    CollisionFilterManager,
     GeometryId,
     GeometrySet,
     InMemoryMesh,
@@ -159,8 +158,7 @@ def build_object_scene(
     physics = model.own_physics(physics)
     builder, drawn = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
     drawn["plant"].Finalize()
-    manager = drawn["scene_graph"].collision_filter_manager()
-    _part_surfaces(drawn["plant"], manager, (drawn["object"], drawn["table"]), [])
+    _part_surfaces(drawn)
     return ObjectScene(simulator=Simulator(builder.Build()), **drawn)
 
 
@@ -223,9 +221,7 @@ def _build(
     plant.Finalize()
 
     # Add what needs the finalized plant: collision filters and the wrist's input.
-    parts = [geometry for geometry, _ in drawn["parts"]]
-    manager = scene_graph.collision_filter_manager()
-    _part_surfaces(plant, manager, (drawn["object"], drawn["table"]), parts)
+    _part_surfaces(drawn, [geometry for geometry, _ in drawn["parts"]])
     _filter_within_hand(plant, scene_graph, instance, fingertips)
     builder.Connect(
         trajectory.get_output_port(),
@@ -254,56 +250,9 @@ def _add_surface(
     properties = ProximityProperties()
     AddRigidHydroelasticProperties(properties)
     _add_material(properties, object_friction(physics), physics)
-    mesh = _surface_mesh(surface, name)
-    return plant.RegisterCollisionGeometry(body, RigidTransform(), mesh, name, properties)
-
-
-def _surface_mesh(surface: Solid, name: str) -> Mesh:
     text = obj_text(surface.vertices, surface.faces, normals=False)
-    return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
-
-
-def swap_object(scene: Scene, model: ObjectModel, physics: PhysicsConfig) -> Scene:
-    """Return a scene of another object that shares its diagram with an existing scene.
-
-    Hand and table take nine tenths of the time of building a scene. The new scene has its own
-    context, in which the object has other surfaces and another inertia. An attempt in it gives the
-    same bits as in a scene that was built. Only one of the two scenes may be simulated at a time,
-    because the wrist's path and the limits of joints belong to the diagram.
-
-    Args:
-        scene: A scene of the same hand, without Meshcat.
-        model: The other object.
-        physics: Physics of the scene, except for friction.
-    """
-    context = scene.simulator.get_context().Clone()
-    graph_context = scene.scene_graph.GetMyMutableContextFromRoot(context)
-    surfaces = {"hand": model.collision_solid, "table": model.resting_surface}
-    ids = scene.plant.GetCollisionGeometriesForBody(scene.object)
-    for geometry, (name, surface) in zip(ids, surfaces.items(), strict=True):
-        mesh = _surface_mesh(surface, name)
-        scene.scene_graph.ChangeShape(graph_context, scene.plant.get_source_id(), geometry, mesh)
-    # A new shape collides with everything until it is filtered.
-    _part_surfaces(
-        scene.plant,
-        scene.scene_graph.collision_filter_manager(graph_context),
-        (scene.object, scene.table),
-        [geometry for geometry, _ in scene.parts],
-    )
-    scene.object.SetSpatialInertiaInBodyFrame(
-        scene.plant.GetMyMutableContextFromRoot(context), object_inertia(model, model.mass)
-    )
-
-    # The scenes with coarse steps and with a motor for each joint are swapped on demand.
-    others = {"coarse_scene": scene.coarse_scene, "own_motors": scene.own_motors}
-    swapped: dict[str, Any] = {
-        name: cache(lambda known=known: swap_object(known(), model, physics))
-        for name, known in others.items()
-        if known is not None
-    }
-    simulator = Simulator(scene.simulator.get_system(), context)
-    physics = physics.model_copy(update={"time_step": scene.physics.time_step})
-    return replace(scene, model=model, physics=physics, simulator=simulator, **swapped)
+    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
+    return plant.RegisterCollisionGeometry(body, RigidTransform(), mesh, name, properties)
 
 
 def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:
@@ -558,20 +507,14 @@ def _of_motors(
     }
 
 
-def _part_surfaces(
-    plant: MultibodyPlant,
-    manager: CollisionFilterManager,
-    bodies: tuple[RigidBody, RigidBody],
-    parts: Sequence[GeometryId],
-) -> None:
+def _part_surfaces(drawn: dict[str, Any], parts: Sequence[GeometryId] = ()) -> None:
     """Let the hand's parts meet only one surface of the object, and the table only the other."""
-    (hand_side, table_side), slab = map(plant.GetCollisionGeometriesForBody, bodies)
+    geometries = drawn["plant"].GetCollisionGeometriesForBody
+    (hand_side, table_side), slab = geometries(drawn["object"]), geometries(drawn["table"])
     declare = CollisionFilterDeclaration()
     declare.ExcludeBetween(GeometrySet(hand_side), GeometrySet(slab))
     declare.ExcludeBetween(GeometrySet(table_side), GeometrySet(parts))
-    # Drake does this for a body's first shapes, but not for shapes that replace them.
-    declare.ExcludeWithin(GeometrySet([hand_side, table_side]))
-    manager.Apply(declare)
+    drawn["scene_graph"].collision_filter_manager().Apply(declare)
 
 
 def _filter_within_hand(
