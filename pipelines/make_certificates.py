@@ -14,8 +14,7 @@ import sys
 from collections.abc import Sequence
 
 from drakegrasp.cli.arguments import Folder
-from drakegrasp.cli.console import run_command, say
-from drakegrasp.cli.help import new_group
+from drakegrasp.cli.console import new_group, run_command, say
 from drakegrasp.cluster.connect import make_certificates
 from drakegrasp.errors import MachineError
 

@@ -15,8 +15,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 import drakegrasp as dg
-from drakegrasp.cli.console import UsageError
-from drakegrasp.cli.help import CLUSTER, MORE
+from drakegrasp.cli.console import CLUSTER, MORE, UsageError
 from drakegrasp.errors import first_line
 from drakegrasp.foreign_files import ADDRESS
 

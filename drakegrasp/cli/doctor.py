@@ -7,6 +7,7 @@ not an error.
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
 import re
 import sys
@@ -26,12 +27,8 @@ EGL_LIBRARY = "libEGL.so.1"
 EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
 #: Memory of a worker, which keeps the scenes of a few objects [B].
 BYTES_PER_CORE = 1e9
-#: Memory limits of the control group, version 2 and 1; containers have one of them.
-CGROUP_LIMITS = (
-    Path("/sys/fs/cgroup/memory.max"),
-    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-)
-MEMINFO = Path("/proc/meminfo")
+#: Memory limit of the control group, which a container has.
+CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,9 +117,7 @@ def check_image() -> Finding:
 
 def check_memory() -> Finding:
     """Return whether the memory is sufficient for a worker on every core."""
-    total, cores = _memory(), available_cores()
-    if total is None:
-        return Finding(name="memory", ok=True, what="unknown")
+    total, cores = memory(), available_cores()
     return _finding(
         "memory",
         total >= BYTES_PER_CORE * cores,
@@ -141,18 +136,10 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(int(part) for part in match[0].split(".")) if match else ()
 
 
-def _memory() -> int | None:
-    """Return the memory [B] of this machine or its container; None if unknown."""
-    limits = []
+def memory() -> int:
+    """Return the memory [B] of this machine or its container."""
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
-        match = re.search(r"^MemTotal:\s*(\d+) kB", MEMINFO.read_text(), re.MULTILINE)
-        limits += [int(match[1]) * 1024] if match else []
-    except OSError:
-        pass
-    for path in CGROUP_LIMITS:
-        # "max", or a number near 2^63, means no limit.
-        try:
-            limits.append(int(path.read_text()))
-        except (OSError, ValueError):
-            continue
-    return min(limits, default=None)
+        return min(machine, int(CGROUP_LIMIT.read_text()))
+    except (OSError, ValueError):  # no file, or "max", which means no limit
+        return machine

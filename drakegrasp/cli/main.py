@@ -11,8 +11,7 @@ import io
 import sys
 from collections.abc import Sequence
 
-from drakegrasp.cli.console import restart_with_utf8, run_command
-from drakegrasp.cli.help import OPTIONS, new_group
+from drakegrasp.cli.console import OPTIONS, new_group, run_command
 
 #: The commands in the order of the help: functions or groups, and the first lines of their help.
 COMMANDS = {
@@ -27,14 +26,14 @@ COMMANDS = {
     "scenes": ("datasets:scenes", "Render views of training scenes, independent of grasps."),
     "check": ("datasets:check", "Check every invariant of a dataset."),
     "stats": ("datasets:stats", "Count outcomes, how well grasps hold, and samples."),
-    "inspect": ("views:inspect", "Render at grasps in a browser, and reject them."),
-    "figures": ("views:figures", "Draw a dataset: pictures as PNG and SVG, numbers as JSON."),
+    "inspect": ("datasets:inspect", "Render at grasps in a browser, and reject them."),
+    "figures": ("datasets:figures", "Draw a dataset: pictures as PNG and SVG, numbers as JSON."),
     "replay": ("datasets:replay", "Run a trial again and compare every value."),
     "predict": ("predict:predict", "Write grasps for what a camera saw, best first."),
     "verify": ("verify:verify", "Try predicted grasps in the simulator."),
     "score": ("score:score", "Score predicted grasps against reference rows."),
     "bench-set": ("build:bench_set", "Build the frozen benchmark drakegrasp-bench-1 in OUT."),
-    "export": ("views:export", "Write the samples of a dataset in another format."),
+    "export": ("datasets:export", "Write the samples of a dataset in another format."),
 }
 #: Commands that the same words continue after Ctrl-C.
 RESUMABLE = ("build", "submit", "bench-set")
@@ -76,7 +75,9 @@ def run() -> None:
     # What is printed to a closed stream is lost, and a file that is opened may get its number.
     if sys.stdout is None:
         sys.exit("error: standard output must be open, got a closed one")
-    restart_with_utf8()
+    # Drake cannot be imported under another locale, nor files with any name be opened.
+    if (encoding := sys.getfilesystemencoding()) != "utf-8":
+        sys.exit(f"error: the locale must be UTF-8, got {encoding}; set PYTHONUTF8=1")
     # A terminal with another encoding shows ? for characters that it does not have.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

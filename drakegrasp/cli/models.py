@@ -14,8 +14,7 @@ from cyclopts.validators import Number
 
 import drakegrasp as dg
 from drakegrasp.cli.arguments import AnyPath, Count, File, Folder, Name, NewFile, Units
-from drakegrasp.cli.console import UsageError, progress_bar, say, say_finding
-from drakegrasp.cli.help import new_group
+from drakegrasp.cli.console import UsageError, new_group, progress_bar, say, say_finding
 from drakegrasp.errors import counted
 
 if TYPE_CHECKING:

@@ -20,8 +20,7 @@ from drakegrasp.cli.arguments import (
     Workers,
     given,
 )
-from drakegrasp.cli.console import same_command, say, say_json, wrong_input
-from drakegrasp.cli.help import MORE
+from drakegrasp.cli.console import MORE, same_command, say, say_json, wrong_input
 
 #: Options that change no verdict: flags, and options with a value.
 IDLE = (

@@ -38,7 +38,8 @@ def make_table(
     title: str,
     heads: Sequence[str],
     rows: Iterable[Sequence[str]],
-    *totals: Sequence[Sequence[str]],
+    total: Sequence[str] = (),
+    *,
     caption: str = "",
 ) -> Table:
     """Return a table with a column of names and columns of numbers.
@@ -48,7 +49,7 @@ def make_table(
         heads: Heads of the columns.
         rows: Cells of each row. Names are shown literally: they can neither style the table nor
             control the terminal.
-        totals: Groups of further rows, each group below a line.
+        total: Cells of a last row, below a line; none if empty.
         caption: Text below the table.
     """
     table = Table(
@@ -64,10 +65,11 @@ def make_table(
     table.add_column(heads[0], no_wrap=True, overflow="ellipsis", max_width=24)
     for head in heads[1:]:
         table.add_column(escape(head), justify="right", no_wrap=True)
-    for group in (rows, *totals):
-        for name, *cells in group:
-            table.add_row(_safe(name), *cells)
+    for name, *cells in rows:
+        table.add_row(_safe(name), *cells)
+    if total:
         table.add_section()
+        table.add_row(*total)
     return table
 
 
@@ -107,7 +109,7 @@ def funnel_table(funnel: Funnel) -> Table:
     rows = ([name, *row(slice(i, i + 1))] for i, name in enumerate(funnel.names))
     total = ["all", *row(slice(None))]
     title = "From palm poses to samples"
-    return make_table(title, ("object", *heads), rows, [total], caption=caption)
+    return make_table(title, ("object", *heads), rows, total, caption=caption)
 
 
 def split_table(counts: Sequence[SplitCount], rule: str) -> Table:

@@ -25,8 +25,7 @@ from drakegrasp.cli.arguments import (
     Workers,
     given,
 )
-from drakegrasp.cli.console import UsageError, say, wrong_input
-from drakegrasp.cli.help import MORE
+from drakegrasp.cli.console import MORE, UsageError, say, wrong_input
 from drakegrasp.errors import GraspError, counted, listed
 
 if TYPE_CHECKING:
