@@ -31,9 +31,8 @@ from drakegrasp.frames import Array, make_pose, rotation_about
 from drakegrasp.hand.checks import Finding, check_files, early_overlaps, judge, overlap_query
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.draft.fingers import Answers, find_fingers, find_palm
-from drakegrasp.hand.draft.grips import Grip, find_grips, trace_finger
+from drakegrasp.hand.draft.grips import Grip, find_grips, find_palm_frames, trace_finger
 from drakegrasp.hand.draft.hand_file import Draft, draft_file, positions
-from drakegrasp.hand.draft.palm import find_palm_frames
 from drakegrasp.hand.draft.source import read_model
 from drakegrasp.hand.draft.vendor import VendorModel, write_urdf
 from drakegrasp.hand.file_format import Drive

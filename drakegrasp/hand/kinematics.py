@@ -129,7 +129,9 @@ def posed_links(hand: Hand, positions: Mapping[str, Array]) -> dict[str, Array]:
             inner, outer = chain.joints[:j], chain.joints[: j + 1]
             if outer not in posed:
                 X = multiply(posed[inner], chain.X_PJ[j])
-                posed[outer] = multiply(X, _motion(chain, j, positions[name]))
+                posed[outer] = multiply(
+                    X, joint_motion(chain.axis[j], positions[name], slides=chain.slides[j])
+                )
     return {
         link: multiply(posed[chain.joints], chain.X_JFi) for link, chain in hand.link_chains.items()
     }
@@ -164,19 +166,25 @@ def _chain_frames(chain: Chain, c: Array) -> tuple[list[Array], Array]:
     X, frames = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4)), []
     for j, X_PJ in enumerate(chain.X_PJ):
         frames.append(multiply(X, X_PJ))
-        X = multiply(frames[-1], _motion(chain, j, q[..., j]))
+        motion = joint_motion(chain.axis[j], q[..., j], slides=chain.slides[j])
+        X = multiply(frames[-1], motion)
     return frames, multiply(X, chain.X_JFi)
 
 
-def _motion(chain: Chain, j: int, position: Array) -> Array:
-    """Return the poses (..., 4, 4) of joint j's motion at positions (...,)."""
-    X = np.zeros((*np.shape(position), 4, 4))
-    X[..., 3, 3] = 1.0
-    if chain.slides[j]:
-        X[..., :3, :3] = np.eye(3)
-        X[..., :3, 3] = chain.axis[j] * np.asarray(position)[..., None]
+def joint_motion(axis: Array, positions: npt.ArrayLike, *, slides: bool) -> Array:
+    """Return the poses (..., 4, 4) of a joint's child at positions (...,), relative to position 0.
+
+    Args:
+        axis: (3,), unit.
+        positions: Positions [rad or m].
+        slides: Whether the joint slides along the axis; else it turns about it.
+    """
+    positions = np.asarray(positions, dtype=float)
+    X = np.zeros((*positions.shape, 4, 4)) + np.eye(4)
+    if slides:
+        X[..., :3, 3] = positions[..., None] * axis
     else:
-        X[..., :3, :3] = rotation_about(chain.axis[j], position)
+        X[..., :3, :3] = rotation_about(axis, positions)
     return X
 
 

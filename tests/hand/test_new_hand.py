@@ -15,7 +15,7 @@ from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_mod
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.draft.fingers import Answers
-from drakegrasp.hand.draft.shapes import THIN, Shape
+from drakegrasp.hand.draft.vendor import THIN, Shape
 from drakegrasp.hand.file_format import MODELS, DrivenBy
 from drakegrasp.hand.finger_sweep import pad_points_at
 from drakegrasp.hand.kinematics import closed_positions, fingertip_forces

@@ -11,7 +11,7 @@ import pytest
 from helpers.mesh_files import READ, REFUSED, write_file
 from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
 
-from drakegrasp.errors import HandError
+from drakegrasp.errors import HandError, MachineError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.source import read_model
 from drakegrasp.hand_setup import draft_hand
@@ -263,7 +263,7 @@ def test_a_draft_of_mjcf_is_urdf_that_needs_no_mujoco(
     monkeypatch.setitem(sys.modules, "mujoco", None)
     assert load_hand(file).num_fingers == 2
     assert not list(file.parent.glob("*.xml"))
-    with pytest.raises(HandError, match=r"^model: MJCF is read with MuJoCo, got none: pip inst"):
+    with pytest.raises(MachineError, match=r"^mujoco must be installed: pip install 'drakegrasp"):
         read_model(path)
 
 

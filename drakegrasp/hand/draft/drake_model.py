@@ -7,27 +7,44 @@ some words as numbers: `hand.parsing` has what the text declares.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import re
 import tempfile
 from collections.abc import Callable
-from functools import cache
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
-from xml.sax.saxutils import escape, unescape
+from xml.sax.saxutils import unescape
 
 import numpy as np
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometryId,
+    Mesh,
+    SceneGraph,
+    SceneGraphInspector,
+    Sphere,
+)
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_content
-from drakegrasp.hand.draft.shapes import Shape, read_mesh, read_shape
-from drakegrasp.hand.draft.vendor import Link, VendorJoint, VendorModel
+from drakegrasp.hand.draft.vendor import (
+    Link,
+    Shape,
+    VendorJoint,
+    VendorModel,
+    ellipsoid,
+    read_mesh,
+    with_hull,
+)
 from drakegrasp.hand.folder import REFERENCES
 from drakegrasp.hand.parsing import (
     ModelFile,
@@ -42,6 +59,7 @@ from drakegrasp.hand.parsing import (
     validate_joint,
     validate_joints,
 )
+from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import obj_text
 
 #: Maximum size of a model's text [bytes].
@@ -77,24 +95,14 @@ def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
     for name, mass in masses.items():
         if mass < 0.0:
             raise HandError(f"model: link {name!r} must have a mass of 0 kg or more, got {mass:g}")
-    plant, graph, uris = MultibodyPlant(1e-3), SceneGraph(), dict[str, str]()
+    plant, graph = MultibodyPlant(1e-3), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(graph)
     with tempfile.TemporaryDirectory() as scratch:
         copy = Path(scratch) / f"model{path.suffix.lower()}"
-
-        def stand_in(uri: str, is_geometry: bool) -> str:
-            # Drake must find a Wavefront file; its triangles are not used.
-            if not is_geometry:
-                return uri
-            digest = hashlib.sha256(uri.encode(errors="surrogateescape")).hexdigest()
-            uris[name := f"{digest[:16]}.obj"] = uri
-            copy.with_name(name).write_text(_STAND_IN, encoding="utf-8")
-            return name
-
-        copy.write_bytes(_rewritten(text, stand_in))
+        rewritten, uris = _with_stand_ins(text, copy.parent)
+        copy.write_bytes(rewritten)
         instance = _parse(plant, copy)
 
-    @cache
     def find_mesh(name: str) -> Shape:
         return read_mesh(find(uris[name], path.parent))
 
@@ -105,7 +113,7 @@ def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
         name, solid = body.name(), plant.GetCollisionGeometriesForBody(body)
         own = solid or plant.GetVisualGeometriesForBody(body)
-        found = (read_shape(graph.model_inspector(), shape, find_mesh) for shape in own)
+        found = (_shape(graph.model_inspector(), shape, find_mesh) for shape in own)
         shapes = tuple(shape for shape in found if shape is not None)
         # Drake replaces a mass of zero by its own value.
         massless = body.default_mass() == 0.0 or masses.get(name) == 0.0
@@ -145,34 +153,32 @@ def _text_of(path: Path) -> tuple[bytes, Element]:
         raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
 
 
-def _rewritten(model: bytes, place: Callable[[str, bool], str]) -> bytes:
-    """Return the text of a model with each reference replaced.
-
-    Args:
-        model: The text.
-        place: Returns the replacement of a reference. Its arguments are the reference and whether
-            it is geometry. If the replacement equals the reference, the bytes do not change.
-    """
-
-    def replaced(match: re.Match[bytes]) -> bytes:
-        kind = str(match.lastgroup)
-        uri = unescape(match[kind].decode(errors="surrogateescape"))
-        new = place(uri, kind in ("uri", "mesh"))
-        if new == uri:
-            return match[0]
-        start, stop = (position - match.start() for position in match.span(kind))
-        written = escape(new).encode(errors="surrogateescape")
-        return match[0][:start] + written + match[0][stop:]
-
-    return REFERENCES.sub(replaced, model)
-
-
 #: A tetrahedron.
 _STAND_IN = obj_text(
     np.vstack((np.zeros(3), 0.01 * np.eye(3))),
     [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
     normals=False,
 )
+
+
+def _with_stand_ins(model: bytes, folder: Path) -> tuple[bytes, dict[str, str]]:
+    """Return the text of a model that names other meshes, and their URIs by the new names.
+
+    Drake must find a Wavefront file; its triangles are not used.
+    """
+    uris = dict[str, str]()
+
+    def replaced(match: re.Match[bytes]) -> bytes:
+        kind = str(match.lastgroup)
+        if kind not in ("uri", "mesh"):
+            return match[0]
+        name = f"mesh{len(uris)}.obj"
+        uris[name] = unescape(match[kind].decode(errors="surrogateescape"))
+        (folder / name).write_text(_STAND_IN, encoding="utf-8")
+        start, stop = (position - match.start() for position in match.span(kind))
+        return match[0][:start] + name.encode() + match[0][stop:]
+
+    return REFERENCES.sub(replaced, model), uris
 
 
 def _parse(plant: MultibodyPlant, path: Path) -> ModelInstanceIndex:
@@ -185,6 +191,36 @@ def _parse(plant: MultibodyPlant, path: Path) -> ModelInstanceIndex:
         raise HandError(str(error).replace(f"{path.parent}/", "")) from None
     finally:
         logger.setLevel(level)
+
+
+def _shape(
+    inspector: SceneGraphInspector, geometry: GeometryId, find_mesh: Callable[[str], Shape]
+) -> Shape | None:
+    """Return a shape that Drake parsed, on its body; None if it has no bounds.
+
+    Args:
+        inspector: The inspector of the scene graph.
+        geometry: The shape.
+        find_mesh: Returns the content of the mesh file that Drake knows by a name.
+
+    Raises:
+        HandError: If its mesh cannot be read.
+    """
+    shape = inspector.GetShape(geometry)
+    found = Shape(X_LS=inspector.GetPoseInFrame(geometry).GetAsMatrix4())
+    if isinstance(shape, Box | Cylinder | Capsule | Sphere):
+        return replace(found, primitive=shape)
+
+    # Other shapes become triangles: those of the file, or of the hull.
+    if isinstance(shape, Mesh | Convex) and shape.source().is_path():
+        mesh = find_mesh(shape.source().path().name)
+        assert mesh.vertices is not None
+        vertices = mesh.vertices * np.asarray(shape.scale3())
+        return replace(found, vertices=vertices, faces=mesh.faces)
+    if isinstance(shape, Ellipsoid):
+        return replace(found, **ellipsoid([shape.a(), shape.b(), shape.c()]))
+    corners = hull_corners(inspector, geometry)
+    return None if corners is None else with_hull(found, corners)
 
 
 def _joint(joint: Any, effort: float) -> VendorJoint:

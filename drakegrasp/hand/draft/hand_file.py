@@ -27,8 +27,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.hand.description import FINGER_DAMPING
 from drakegrasp.hand.draft.fingers import Answers
-from drakegrasp.hand.draft.grips import Finger, Grip
-from drakegrasp.hand.draft.palm import PalmFrame
+from drakegrasp.hand.draft.grips import Finger, Grip, PalmFrame
 from drakegrasp.hand.draft.vendor import VendorModel
 from drakegrasp.hand.file_format import VERSION
 from drakegrasp.hand.parsing import Mimic

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Capsule, Cylinder, Sphere
@@ -23,8 +24,16 @@ from drakegrasp.arithmetic import norm
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.hand.draft.shapes import Shape, ellipsoid, read_mesh
-from drakegrasp.hand.draft.vendor import ENDLESS, Link, VendorJoint, VendorModel, motion
+from drakegrasp.hand.draft.vendor import (
+    ENDLESS,
+    Link,
+    Shape,
+    VendorJoint,
+    VendorModel,
+    ellipsoid,
+    read_mesh,
+)
+from drakegrasp.hand.kinematics import joint_motion
 from drakegrasp.hand.parsing import Mimic
 
 #: Maximum size of a model's text [bytes].
@@ -39,15 +48,9 @@ def compile_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
         find: Returns the file of a mesh, given the folder in which the model looks for it.
 
     Raises:
-        HandError: If MuJoCo is missing or rejects the file, a mesh cannot be read, or the model has
-            something that no hand of rigid links has.
+        HandError: If MuJoCo rejects the file, a mesh cannot be read, or the model has something
+            that no hand of rigid links has.
     """
-    try:
-        import mujoco
-    except ImportError:
-        raise HandError(
-            "model: MJCF is read with MuJoCo, got none: pip install 'drakegrasp[peer]'"
-        ) from None
     try:  # MuJoCo replaces NaN by its defaults
         if found := re.search(rb"[\s\"']nan[\s\"']", read_content(path, LONGEST), re.I):
             raise ValueError(f"{found[0].decode()!r}, which is no number")
@@ -66,15 +69,15 @@ def compile_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
     names = [model.joint(j).name or _joint_name(model, bodies, j) for j in range(model.njnt)]
     links, notes = dict[str, Link](), list[str]()
     for b in range(1, model.nbody):
-        links[bodies[b]] = _link(mujoco, model, b, bodies[b], notes)
-    efforts, joints = _efforts(mujoco, model, names), dict[str, VendorJoint]()
-    for joint in _joints(mujoco, model, bodies, names):
+        links[bodies[b]] = _link(model, b, bodies[b], notes)
+    efforts, joints = _efforts(model, names), dict[str, VendorJoint]()
+    for joint in _joints(model, bodies, names):
         joints[joint.name] = replace(joint, effort=efforts.get(joint.name, 0.0))
         links.setdefault(joint.child, Link(name=joint.child, inertia=SpatialInertia.Zero()))
     for named in (bodies, names):
         if twins := sorted({name for name in named if named.count(name) > 1}):
             raise HandError(f"model: names must be unique, got {twins[0]!r} twice")
-    mimics = {mimic.joint: mimic for mimic in _mimics(mujoco, model, names, notes)}
+    mimics = {mimic.joint: mimic for mimic in _mimics(model, names, notes)}
     name = model.names.partition(b"\0")[0].decode()
     return VendorModel(name=name, links=links, joints=joints, mimics=mimics, notes=tuple(notes))
 
@@ -110,9 +113,7 @@ def _pose(p: Array, quaternion: Array) -> Array:
     return make_pose(R.matrix(), p)
 
 
-def _joints(
-    mujoco: Any, model: Any, bodies: Sequence[str], names: Sequence[str]
-) -> Iterator[VendorJoint]:
+def _joints(model: Any, bodies: Sequence[str], names: Sequence[str]) -> Iterator[VendorJoint]:
     """Yield what carries each body. The hand is free, however the file fixes it to the world.
 
     A body with several joints has a body without mass between each two of them.
@@ -143,7 +144,7 @@ def _joints(
                 name=names[j],
                 parent=parent,
                 child=child,
-                X_PJ=X_PB @ X_BJ @ motion(axis, slides, -reference),
+                X_PJ=X_PB @ X_BJ @ joint_motion(axis, -reference, slides=slides),
                 X_CJ=X_BJ,
                 axis=axis,
                 slides=slides,
@@ -152,7 +153,7 @@ def _joints(
             parent, X_PB = child, np.eye(4)
 
 
-def _link(mujoco: Any, model: Any, b: int, name: str, notes: list[str]) -> Link:
+def _link(model: Any, b: int, name: str, notes: list[str]) -> Link:
     """Return a body with its shapes; `notes` receives a line for each shape that is left out."""
     mass, inertia = float(model.body_mass[b]), SpatialInertia.Zero()
     if not np.isfinite([mass, *model.body_inertia[b], *model.body_ipos[b]]).all():
@@ -165,7 +166,7 @@ def _link(mujoco: Any, model: Any, b: int, name: str, notes: list[str]) -> Link:
     # Shapes that collide, or else those that are drawn.
     collisions, pictures = list[Shape](), list[Shape]()
     for g in np.flatnonzero(model.geom_bodyid == b).tolist():
-        shape = _shape(mujoco, model, g)
+        shape = _shape(model, g)
         if shape is None:
             kind = mujoco.mjtGeom(int(model.geom_type[g])).name.removeprefix("mjGEOM_").lower()
             notes.append(f"link {name}: a shape of type {kind} is not kept")
@@ -177,7 +178,7 @@ def _link(mujoco: Any, model: Any, b: int, name: str, notes: list[str]) -> Link:
     return Link(name=name, inertia=inertia, collisions=tuple(collisions), pictures=drawn)
 
 
-def _shape(mujoco: Any, model: Any, g: int) -> Shape | None:
+def _shape(model: Any, g: int) -> Shape | None:
     """Return a shape on its body; None for a kind that no hand has."""
     kinds, kind, size = mujoco.mjtGeom, int(model.geom_type[g]), model.geom_size[g]
     X_BS = _pose(model.geom_pos[g], model.geom_quat[g])
@@ -202,7 +203,7 @@ def _shape(mujoco: Any, model: Any, g: int) -> Shape | None:
     return Shape(X_LS=X_BS, vertices=vertices, faces=faces)
 
 
-def _mimics(mujoco: Any, model: Any, joints: Sequence[str], notes: list[str]) -> Iterator[Mimic]:
+def _mimics(model: Any, joints: Sequence[str], notes: list[str]) -> Iterator[Mimic]:
     """Yield the active equalities of joints; `notes` receives a line for each other one."""
     for e in np.flatnonzero(model.eq_active0):
         kind = mujoco.mjtEq(int(model.eq_type[e]))
@@ -226,7 +227,7 @@ def _mimics(mujoco: Any, model: Any, joints: Sequence[str], notes: list[str]) ->
         yield Mimic(joint=name, leader=joints[led_by], ratio=ratio, offset=offset)
 
 
-def _efforts(mujoco: Any, model: Any, joints: Sequence[str]) -> dict[str, float]:
+def _efforts(model: Any, joints: Sequence[str]) -> dict[str, float]:
     """Return the effort of each joint whose actuators, or which itself, have force ranges.
 
     Forces that follow from gains and controls, or from tendons, differ between postures.

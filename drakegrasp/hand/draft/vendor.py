@@ -1,10 +1,8 @@
-"""A vendor's model as data: a tree of rigid links, and the joints between them.
+"""A vendor's model as data: a tree of rigid links with shapes, and the joints between them.
 
-Input: bodies and joints as `drake_model` or `mujoco_model` reads them. Output of `weld`: a
-`VendorModel` in which bodies that are fixed to each other are one link, every link has a mass and
-an inertia that a body can have, and each follower names the joint that leads it. The frame of a
-link is the frame of the joint that carries it. `write_urdf` writes such a model, with its meshes as
-Wavefront files beside it.
+`drake_model` and `mujoco_model` read such models, `source` welds their links, and `write_urdf`
+writes them, with their meshes as Wavefront files beside the URDF. After welding the frame of a link
+is the frame of the joint that carries it.
 """
 
 from __future__ import annotations
@@ -13,32 +11,99 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+import numpy.typing as npt
+import trimesh
 from pydrake.geometry import Box, Capsule, Cylinder, Sphere
 from pydrake.math import RotationMatrix
-from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from pydrake.multibody.tree import SpatialInertia
 
-from drakegrasp.errors import HandError
-from drakegrasp.frames import Array, invert_pose, rotation_about, transform_points
-from drakegrasp.hand.draft.shapes import Shape, added, solid_inertia
-from drakegrasp.hand.parsing import Mimic, validate_limits
-from drakegrasp.mesh.surfaces import obj_text
+from drakegrasp.arithmetic import dot
+from drakegrasp.errors import HandError, MeshError
+from drakegrasp.frames import Array, transform_points
+from drakegrasp.hand.kinematics import joint_motion
+from drakegrasp.hand.parsing import Mimic
+from drakegrasp.hand.shapes import ball_corners, primitive_corners
+from drakegrasp.mesh.loading import load_surface
+from drakegrasp.mesh.surfaces import Faces, obj_text
 
+#: Number of corners of the hull of a collision mesh; on a ball of 10 mm radius they miss less than
+#: 0.4 mm.
+CORNERS = 64
+#: Minimum thickness of a hull [m]: a plane has no hull.
+THIN = 4e-4
 #: Limits of a joint that has none.
 ENDLESS = np.array([-np.inf, np.inf])
-#: Smallest fraction of a leader's range that the limits of a follower must leave to it.
-ROOM = 0.5
-#: Smallest and largest size of a hand, including an arm [m]; other sizes mean other units.
-SIZES = (0.03, 3.0)
-#: Mass [kg] and radius [m] of a moving link that has neither mass nor shape.
-BARE_MASS, BARE_RADIUS = 1e-3, 0.016
 #: Folder of the meshes.
 MESHES = "meshes"
 #: Velocity limit of a joint that has none [rad/s or m/s].
 FAST = 10.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shape:
+    """A shape on a link: a primitive, or else a mesh.
+
+    Attributes:
+        X_LS: Pose of the shape on the link, (4, 4).
+        primitive: A box, cylinder, capsule or sphere.
+        vertices: (n, 3), vertices of a mesh, in its own frame [m].
+        faces: (m, 3), faces of a mesh.
+    """
+
+    X_LS: Array = field(default_factory=lambda: np.eye(4))
+    primitive: Box | Cylinder | Capsule | Sphere | None = None
+    vertices: Array | None = None
+    faces: Faces | None = None
+
+    def corners(self) -> Array:
+        """Return points (n, 3) with the same hull as the shape, in the link's frame [m]."""
+        own = self.vertices if self.primitive is None else primitive_corners(self.primitive)
+        assert own is not None
+        return transform_points(self.X_LS, own)
+
+    def hull(self) -> Shape:
+        """Return the convex hull of a mesh, with few corners; other shapes unchanged."""
+        if self.vertices is None:
+            return self
+        points = self.vertices
+        if np.ptp(points, axis=0).min() < THIN / 4.0:
+            points = np.concatenate([points - THIN / 2.0, points + THIN / 2.0])
+
+        # The farthest points along the link's axes, and along even directions.
+        axes = self.X_LS[:3, :3]
+        directions = np.concatenate([axes, -axes, ball_corners(1.0, CORNERS)])
+        farthest = np.unique([int(np.argmax(dot(points, d))) for d in directions])
+        return with_hull(self, points[farthest])
+
+
+def with_hull(shape: Shape, points: Array) -> Shape:
+    """Return a shape whose mesh is the convex hull of points (n, 3)."""
+    solid = trimesh.convex.convex_hull(points)
+    return replace(shape, vertices=np.array(solid.vertices), faces=np.array(solid.faces))
+
+
+def ellipsoid(axes: npt.ArrayLike) -> dict[str, Any]:
+    """Return vertices and faces of an ellipsoid with half axes (3,) [m]."""
+    ball = trimesh.creation.icosphere(2)
+    return {"vertices": np.array(ball.vertices) * np.asarray(axes), "faces": np.array(ball.faces)}
+
+
+def read_mesh(path: Path) -> Shape:
+    """Return the content of a mesh file.
+
+    Raises:
+        HandError: If the file is missing or not a mesh, see `drakegrasp.mesh.loading`.
+    """
+    try:
+        vertices, faces = load_surface(path)
+    except MeshError as error:
+        raise HandError(f"model: mesh {error}") from None
+    return Shape(vertices=vertices, faces=faces)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,7 +168,7 @@ class VendorJoint:
 
     def motion(self, positions: Array | float) -> Array:
         """Return the poses (..., 4, 4) of the child at positions (...), relative to position 0."""
-        return motion(self.axis, self.slides, positions)
+        return joint_motion(self.axis, positions, slides=self.slides)
 
     def pose(self, position: float) -> Array:
         """Return the pose (4, 4) of the joint's moving frame in the parent."""
@@ -113,23 +178,6 @@ class VendorJoint:
         """Return the joint with positions c instead of q, where q = zero + sign * c."""
         limits = np.sort((self.limits - zero) * sign)
         return replace(self, X_PJ=self.pose(zero), axis=sign * self.axis, limits=limits)
-
-
-def motion(axis: Array, slides: bool, positions: Array | float) -> Array:
-    """Return the poses (..., 4, 4) of a joint's child at positions (...), relative to position 0.
-
-    Args:
-        axis: (3,), unit.
-        slides: Whether the joint slides along the axis; else it turns about it.
-        positions: Positions [rad or m].
-    """
-    positions = np.asarray(positions, dtype=float)
-    X = np.zeros((*positions.shape, 4, 4)) + np.eye(4)
-    if slides:
-        X[..., :3, 3] = positions[..., None] * axis
-    else:
-        X[..., :3, :3] = rotation_about(axis, positions)
-    return X
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -194,177 +242,6 @@ class VendorModel:
         own, other = self.mimic(joint), self.mimic(to)
         ratio = own.ratio / other.ratio
         return (ratio, own.offset - ratio * other.offset) if own.leader == other.leader else None
-
-
-def weld(model: VendorModel) -> VendorModel:
-    """Return a model in which bodies that are fixed to each other are one link.
-
-    Raises:
-        HandError: If it is not one tree of links of a hand's size, or joints cannot follow their
-            leaders. The message has one line.
-    """
-    carriers = _carriers(model)
-    places, links, notes = _places(model, carriers), dict[str, Link](), list(model.notes)
-    for head in dict.fromkeys(head for head, _ in places.values()):
-        members = [(model.links[b], X_LB) for b, (at, X_LB) in places.items() if at == head]
-        links[head], remarks = _weld(members)
-        notes += remarks
-
-    # The joints that move, each between two links.
-    joints = {}
-    for head, link in links.items():
-        if head in carriers:
-            joint = carriers[head]
-            validate_limits(joint.name, *joint.limits)
-            above, X_LP = places[joint.parent]
-            joints[joint.name] = replace(
-                joint,
-                parent=links[above].name,
-                child=link.name,
-                X_PJ=X_LP @ joint.X_PJ,
-                X_CJ=np.eye(4),
-            )
-    mimics = _leaders(model.mimics, joints)
-    named = {link.name: link for link in links.values()}
-    welded = replace(model, links=named, joints=joints, mimics=mimics, notes=tuple(notes))
-    _validate_size(welded)
-    return welded
-
-
-def _carriers(model: VendorModel) -> dict[str, VendorJoint]:
-    """Return the joint that carries each body except for the root."""
-    found: dict[str, VendorJoint] = {}
-    for joint in model.joints.values():
-        if joint.child in found:
-            raise HandError(
-                f"model: link {joint.child!r} must be carried by one joint, got "
-                f"{found[joint.child].name!r} and {joint.name!r}: cut the closed loop"
-            )
-        found[joint.child] = joint
-    roots = [name for name in model.links if name not in found]
-    if len(roots) != 1:
-        got = f"{len(roots)} ({', '.join(roots)})" if roots else "none: its joints form a loop"
-        raise HandError(f"model: must be one tree of links, with one root, got {got}")
-    return found
-
-
-def _places(
-    model: VendorModel, carriers: Mapping[str, VendorJoint]
-) -> dict[str, tuple[str, Array]]:
-    """Return for each body the first body of its link, and its pose (4, 4) in the link.
-
-    Bodies come after their parents.
-    """
-    # Go from the root outwards. The frame of a link is that of its joint.
-    order = [model.root]
-    places: dict[str, tuple[str, Array]] = {}
-    for body in order:
-        joint = carriers.get(body)
-        if joint is None:
-            places[body] = body, np.eye(4)
-        elif joint.moves:
-            places[body] = body, invert_pose(joint.X_CJ)
-        else:
-            head, X_LP = places[joint.parent]
-            places[body] = head, X_LP @ joint.X_PJ @ invert_pose(joint.X_CJ)
-        order += model.below(body)
-    if len(order) < len(model.links):
-        lost = next(name for name in model.links if name not in places)
-        raise HandError(f"model: must be one tree of links, got a loop at link {lost!r}")
-
-    # The frame of the root is that of its heaviest body.
-    members = [body for body, (head, _) in places.items() if head == model.root]
-    heaviest = max(members, key=lambda body: model.links[body].weight)
-    X_LR = invert_pose(places[heaviest][1])
-    return places | {body: (model.root, X_LR @ places[body][1]) for body in members}
-
-
-def _weld(members: Sequence[tuple[Link, Array]]) -> tuple[Link, list[str]]:
-    """Return the link of bodies with poses (4, 4) in its frame, and notes of what was added."""
-    # Join the shapes; without collision shapes, the visual shapes also collide.
-    name, notes = max((body for body, _ in members), key=lambda body: body.weight).name, []
-    solids, pictures = (
-        [replace(s, X_LS=X_LB @ s.X_LS) for body, X_LB in members for s in getattr(body, kind)]
-        for kind in ("collisions", "pictures")
-    )
-    if pictures and not solids:
-        notes.append(f"link {name}: the model has no collision shapes; hulls of its pictures")
-    collisions = [shape.hull() for shape in solids or pictures]
-
-    # Add the inertias about the link's origin.
-    total = SpatialInertia.Zero()
-    for body, X_LB in members:
-        if body.inertia.get_mass() > 0.0:
-            own = body.inertia.ReExpress(RotationMatrix(X_LB[:3, :3])).Shift(-X_LB[:3, 3])
-            total = added(total, own)
-
-    # Vendors leave out masses of small links, and give inertias that no body has.
-    ball = SpatialInertia(BARE_MASS, np.zeros(3), UnitInertia.SolidSphere(BARE_RADIUS))
-    if total.get_mass() == 0.0:
-        total = solid_inertia(collisions) if collisions else ball
-        if collisions:
-            mass = f"{1e3 * total.get_mass():.0f} g by its size"
-            notes.append(f"link {name}: the model gives no mass; {mass}")
-    elif wrong := next((body.impossible for body, _ in members if body.impossible), ""):
-        notes.append(
-            f"link {name}: the model's inertia is impossible ({wrong}); that of its shapes is used"
-        )
-        likely = solid_inertia(collisions) if collisions else ball
-        total = SpatialInertia(total.get_mass(), likely.get_com(), likely.get_unit_inertia())
-    return Link(name=name, inertia=total, collisions=tuple(collisions)), notes
-
-
-def _leaders(given: Mapping[str, Mimic], joints: Mapping[str, VendorJoint]) -> dict[str, Mimic]:
-    """Return the leader of each following joint, through chains of mimics.
-
-    Raises:
-        HandError: If mimics form a circle, name something that is not a moving joint, or limits
-            keep a joint from following.
-    """
-    found: dict[str, Mimic] = {}
-    for name, mimic in given.items():
-        must = f"model: joint {name!r} must"
-        if name not in joints:
-            raise HandError(f"{must} turn or slide, as it follows {mimic.leader!r}")
-
-        # Follow the leaders up to a joint that follows none.
-        ratio, offset, leader, seen = mimic.ratio, mimic.offset, mimic.leader, {name}
-        while leader in given and leader not in seen:
-            seen.add(leader)
-            above = given[leader]
-            ratio, offset, leader = ratio * above.ratio, offset + ratio * above.offset, above.leader
-        if leader in seen:
-            raise HandError(f"{must} follow a joint that leads, got a circle of mimics")
-        if leader not in joints:
-            raise HandError(f"{must} follow a joint that moves, got {leader!r}")
-        if ratio == 0.0:
-            raise HandError(f"{must} follow {leader!r} by a ratio, got 0")
-        found[name] = Mimic(joint=name, leader=leader, ratio=ratio, offset=offset)
-
-        # Limits of some vendors' followers have the wrong sign.
-        lower, upper = joints[name].limits
-        led = np.sort(ratio * joints[leader].limits + offset)
-        shared = min(led[1], upper) - max(led[0], lower)
-        if np.isfinite(led).all() and shared < ROOM * (led[1] - led[0]):
-            raise HandError(
-                f"{must} have limits that let it follow {leader!r}, {led[0]:g}..{led[1]:g}, got "
-                f"{lower:g}..{upper:g}"
-            )
-    return found
-
-
-def _validate_size(model: VendorModel) -> None:
-    """Reject a model without shapes, or a model whose units are not metres."""
-    points = [transform_points(model.pose(n, {}), own.corners()) for n, own in model.links.items()]
-    cloud = np.concatenate(points)
-    if not len(cloud):
-        raise HandError("model: must have shapes, got links without any")
-    size = float(np.ptp(cloud, axis=0).max())
-    if not SIZES[0] <= size <= SIZES[1]:
-        raise HandError(
-            f"model: must be a hand in metres, got one of {size:.3g} m: check units and scales of "
-            "its meshes"
-        )
 
 
 def write_urdf(model: VendorModel, path: Path, comments: Sequence[str]) -> None:
