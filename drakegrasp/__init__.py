@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
-    from drakegrasp.scoring.proposals import propose
+    from drakegrasp.scoring.predicting import propose
     from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
     from drakegrasp.simulation.attempts import make_posture
@@ -88,7 +88,7 @@ _HOMES = {
     "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",
-    "propose": "scoring.proposals",
+    "propose": "scoring.predicting",
     "rank": "scoring.ranking",
     "replay_trial": "generation.replay",
     "run_trial": "simulation.posture",

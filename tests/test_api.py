@@ -43,8 +43,7 @@ from drakegrasp.verification.placing import (
     place_on_object,
     place_on_rows,
 )
-from drakegrasp.verification.result import Verification
-from drakegrasp.verification.result_files import write_results
+from drakegrasp.verification.result import Verification, write_results
 from drakegrasp.verification.verify import verify_batch
 
 pytestmark = pytest.mark.sim

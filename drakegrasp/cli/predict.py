@@ -138,7 +138,7 @@ def _validate_place(out: Path, source: Path) -> None:
         DataError: If it cannot be written.
     """
     from drakegrasp.exchange.attempts import holds_postures
-    from drakegrasp.verification.result_files import validate_writable
+    from drakegrasp.runtime.files import validate_writable
 
     if out.suffix.lower() not in HDF5:
         raise UsageError(f"--out must be a file {' or '.join(HDF5)}, got {str(out)!r}")

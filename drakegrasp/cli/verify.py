@@ -161,7 +161,8 @@ def _by_lift(path: Path, target: Target, out: Path | None, *, lines: bool, **how
     """Write the verdicts of a lift, and print their counts."""
     from drakegrasp.api.verifying import run_verification
     from drakegrasp.exchange.columns import HDF5_SUFFIXES
-    from drakegrasp.verification.result_files import json_line, validate_writable, write_results
+    from drakegrasp.runtime.files import validate_writable
+    from drakegrasp.verification.result import json_line, write_results
 
     # All input is read and checked before anything is simulated.
     if out is not None:
@@ -238,7 +239,7 @@ def _bench_files(path: Path, target: Target, where: str, assets: Path | None) ->
     Raises:
         GraspError: If there are such files, and options do not fit them.
     """
-    from drakegrasp.protocols.files import is_grasp_file
+    from drakegrasp.protocols.postures import is_grasp_file
 
     suffix = Path(target.hand or "").suffix
     files = [path] if path.is_file() else sorted(path.rglob("*.npy"))

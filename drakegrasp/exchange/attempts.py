@@ -34,7 +34,7 @@ from drakegrasp.exchange import columns
 from drakegrasp.exchange.columns import ARRAYS, CONTACTS, HDF5_SUFFIXES, array_names, read_contacts
 from drakegrasp.frames import Array, as_numbers, unpack_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.protocols.files import is_grasp_file
+from drakegrasp.protocols.postures import is_grasp_file
 from drakegrasp.runtime.files import atomic_path
 from drakegrasp.simulation.attempts import (
     CONDITIONS,

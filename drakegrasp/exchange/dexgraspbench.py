@@ -47,7 +47,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.surfaces import hull_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.pictures.still_scene import StillScene
-from drakegrasp.protocols.files import POSTURES, read_grasp_file
+from drakegrasp.protocols.postures import POSTURES, read_grasp_file
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.progress import Report, silent

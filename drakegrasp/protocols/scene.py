@@ -1,23 +1,25 @@
 """Hand and object in MuJoCo, with the numbers of a protocol.
 
-Input: the MJCF of a hand, an object's convex parts and a protocol. Output: a `ProtocolScene`, which
-can be reset, moved, pushed and measured. The hand's root is welded to a body that moves on command,
-as in DexGraspBench (`src/util/hand_util.py`). Needs the extra `[peer]`.
+Input: the MJCF of a hand, a folder with an object's convex parts, and a protocol. Output: a
+`ProtocolScene`, which can be reset, moved, pushed and measured. The hand's root is welded to a body
+that moves on command, as in DexGraspBench (`src/util/hand_util.py`). Needs the extra `[peer]`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from drakegrasp.errors import HandError, MeshError, one_line
+from drakegrasp.errors import DataError, HandError, MeshError, one_line
+from drakegrasp.foreign_files import read_json
 from drakegrasp.frames import Array
 from drakegrasp.mjcf import make_spec
-from drakegrasp.protocols.files import ObjectFolder
 from drakegrasp.protocols.protocol import MujocoProtocol
 
 #: Prefix of the names that come from the hand's MJCF.
@@ -36,6 +38,60 @@ _DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
 )
+#: Paths of the parts and of the volume within the folder of an object.
+PARTS, INFO = "urdf/meshes", "info/simplified.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectFolder:
+    """Convex parts in the object's frame {O}.
+
+    Attributes:
+        parts: Wavefront files, sorted by name.
+        scale: Factor by which their coordinates are multiplied.
+        volume: Volume of the scaled object [m^3].
+        digest: 16 digits of the SHA-256 of the parts and the volume.
+    """
+
+    parts: tuple[Path, ...]
+    scale: float
+    volume: float
+    digest: str
+
+
+def read_object_folder(folder: Path, scale: float) -> ObjectFolder:
+    """Return the object of a folder.
+
+    Args:
+        folder: Folder in DexGraspBench's layout.
+        scale: Scale of the object.
+
+    Raises:
+        DataError: If the folder has no parts, or its volume cannot be read.
+    """
+    parts = tuple(sorted((folder / PARTS).glob("*.obj")))
+    if not parts:
+        raise DataError(f"{folder / PARTS}: must hold the object's convex parts (.obj), got none")
+    if not (math.isfinite(scale) and scale > 0.0):
+        raise DataError(f"{folder}: scale must be a positive number, got {scale}")
+    try:
+        info = read_json(folder / INFO)
+        unit = info["mass"] / (info["density"] * info["scale"] ** 3)
+    except (KeyError, TypeError, ArithmeticError, OSError, ValueError) as error:
+        raise DataError(
+            f"{folder / INFO}: must have mass, density and scale, got {one_line(error)}"
+        ) from None
+    if not (math.isfinite(unit) and unit > 0.0):
+        raise DataError(f"{folder / INFO}: the volume must be positive, got {unit}")
+
+    # The digest identifies the object, whatever the name of its folder.
+    text = hashlib.sha256()
+    for part in parts:
+        text.update(part.read_bytes())
+    text.update(repr((unit, scale)).encode())
+    return ObjectFolder(
+        parts=parts, scale=scale, volume=unit * scale**3, digest=text.hexdigest()[:16]
+    )
 
 
 class ProtocolScene:

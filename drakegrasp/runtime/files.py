@@ -258,6 +258,28 @@ def probe_folder(folder: Path) -> None:
     probe.unlink()
 
 
+def validate_writable(out: Path) -> None:
+    """Reject a file that cannot be written; no file is left behind.
+
+    Raises:
+        DataError: If it is a folder, or the folder of the file cannot be written (if it does not
+            exist: the first existing folder above it).
+    """
+    if out.is_dir():
+        raise DataError(f"{out}: must be a file, got a folder; choose another --out")
+
+    # Find the first existing folder above the file.
+    folder = out.absolute().parent
+    while not os.path.lexists(folder):
+        folder = folder.parent
+    try:
+        probe_folder(folder)
+    except OSError:
+        raise DataError(
+            f"{out}: must be in a folder that can be written, got {folder}; choose another --out"
+        ) from None
+
+
 def open_own(path: Path, flags: int) -> int:
     """Open a file to write it in place, without following links; return its descriptor.
 

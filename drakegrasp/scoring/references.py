@@ -21,7 +21,7 @@ from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, unpack_grasp
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.scoring.proposals import propose
+from drakegrasp.scoring.predicting import propose
 from drakegrasp.scoring.ranking import rank
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempts import Attempts, make_attempts

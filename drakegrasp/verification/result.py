@@ -1,13 +1,15 @@
-"""The result of verifying one grasp: the verdict, what was simulated, and why, in sentences.
+"""The result of verifying one grasp: the verdict, what was simulated, and why; results as files.
 
 Input: what `verify` measured. Output: a `Verification` and its explanation. The explanation states
 whether the grasp holds and why, what moved, and how close the contacts are to the requested ones.
-If the points are off the object, this is reported first.
+If the points are off the object, this is reported first. Results are written as lines of strict
+JSON and as an HDF5 file, both with the fields `schema.VERIFICATION_FIELDS`. Equal results give
+equal HDF5 files, because only the JSON contains wall-clock times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,12 +19,19 @@ import numpy as np
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import AnyArray, write_field
+from drakegrasp.dataset.json_files import strict_json
+from drakegrasp.dataset.manifest import finger_names, installed_versions, origin_attributes
+from drakegrasp.dataset.reader import PredictedRows
+from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.filters import Removal
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, pack_pose
 from drakegrasp.generation.attempts import unjudged
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.parsing import position_order
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed
+from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
@@ -31,6 +40,9 @@ from drakegrasp.verification.hints import FAR, find_hints
 from drakegrasp.verification.margin import contact_epsilon
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.wrist_solver import WristFit
+
+#: Group of the HDF5 file that holds the fields.
+GROUP = "grasps"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -430,3 +442,71 @@ def _as_a_sample(verified: Verification, removal: Removal) -> str:
 def in_mm(length: float) -> str:
     """Return a length [m] as text in millimetres."""
     return f"{1e3 * length:.1f} mm"
+
+
+# Files
+
+
+def json_line(index: int, result: Verification) -> str:
+    """Return a verdict as a line of strict JSON; NaN and infinity become null.
+
+    Keys are those of the HDF5 fields, and what only people and logs need.
+
+    Args:
+        index: Index of the grasp.
+        result: The verdict on the grasp.
+    """
+    values = {field.name: field.value_of(result) for field in VERIFICATION_FIELDS}
+    line = {
+        "index": index,
+        **values,
+        "unjudged": result.unjudged if result.removal is not None else (),
+        "outcomes": [each.trial.outcome for each in result.tries],
+        "explain": result.explain(),
+        "seconds": result.seconds,
+    }
+    return strict_json(line)
+
+
+def write_results(
+    results: Sequence[Verification],
+    path: Path,
+    config: Config,
+    rows: PredictedRows | None = None,
+) -> None:
+    """Write results to an HDF5 file, which appears complete or not at all.
+
+    Args:
+        results: The results, in the order of the grasps.
+        path: The file.
+        config: Configuration of the verification.
+        rows: Rows of the dataset that the grasps are for, in the same order; None without a
+            dataset.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written.
+    """
+    hand = load_hand(config.hand_source)
+    shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
+    with atomic_hdf5(path) as file:
+        versions, fingers = installed_versions(config), finger_names(config)
+        joints = position_order(hand.model, hand.palm_link)
+        origin = origin_attributes(config, versions, fingers, joints)
+        file.attrs.update(origin)
+        group = file.create_group(GROUP)
+        for field in VERIFICATION_FIELDS:
+            write_field(group, field, _column(field, results, shape))
+        if rows is not None:
+            rows.write(file)
+
+
+def _column(field: Field, results: Sequence[Verification], shape: dict[str, int]) -> AnyArray:
+    """Return the values of a field for all results; empty values for stages not reached."""
+    if field.dtype == "str":
+        return np.array([field.value_of(result) for result in results], dtype=object)
+    column = field.empty(len(results), shape)
+    for i, result in enumerate(results):
+        value = field.value_of(result)
+        if value is not None:
+            column[i] = pack_pose(value) if field.shape == "12" else value
+    return column

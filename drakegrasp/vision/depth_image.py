@@ -1,9 +1,9 @@
 """Depth images of a user's own camera: the points of an object, its table, its surface.
 
 Input: a depth image in metres, the camera matrix, and a mask of the object. Output: points in {T},
-for `scoring.proposals` and `scoring.ranking`. The pose of the camera over the table is known, or it
-follows from the plane on which the object stands. Pixels without a depth (0, NaN or infinite) are
-left out. Image files and camera files are read here too.
+for the room `scoring`. The pose of the camera over the table is known, or it follows from the plane
+on which the object stands. Pixels without a depth (0, NaN or infinite) are left out. Image files
+and camera files are read here too.
 
 `complete` closes what an image shows of an object to a surface that can be simulated. It takes a
 solid that was guessed from the visible points (`mesh.cloud`), and cuts away the space that the

@@ -47,7 +47,7 @@ from drakegrasp.hand.settings import override_config
 from drakegrasp.mesh.surfaces import first_hits
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.protocols.postures import prepare_trials, verify_postures
-from drakegrasp.scoring.lifting import chances
+from drakegrasp.scoring.ranking import chances
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import builtin_object, draw_builtin
 from drakegrasp.simulation.attempts import Attempts

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
 
 from drakegrasp.exchange.dexgraspbench import write_object
-from drakegrasp.protocols.files import ObjectFolder, read_object_folder
 from drakegrasp.protocols.protocol import DexGraspBench, GraspMotion, MujocoProtocol
+
+if TYPE_CHECKING:
+    from drakegrasp.protocols.scene import ObjectFolder
 
 #: Edge of the box [m].
 EDGE = 0.04
@@ -42,6 +44,8 @@ HERE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
 
 def box_folder(folder: Path, *edges: float) -> ObjectFolder:
+    from drakegrasp.protocols.scene import read_object_folder
+
     write_object(folder, [np.asarray(trimesh.creation.box(edges).vertices)])
     return read_object_folder(folder, 1.0)
 

@@ -11,9 +11,8 @@ from helpers.jaws import EDGE, HAND, box_folder, changed, jaws
 
 pytest.importorskip("mujoco")
 
-from drakegrasp.protocols.files import ObjectFolder
 from drakegrasp.protocols.protocol import GraspMotion, PostureVerdict
-from drakegrasp.protocols.scene import ProtocolScene
+from drakegrasp.protocols.scene import ObjectFolder, ProtocolScene
 
 
 @pytest.fixture(scope="session")

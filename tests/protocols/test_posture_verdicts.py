@@ -18,14 +18,15 @@ from helpers.jaws import HERE, jaws
 
 from drakegrasp.errors import ConfigError, DataError, HandError, MachineError
 from drakegrasp.exchange.dexgraspbench import write_object
-from drakegrasp.protocols.files import read_grasp_file, read_object_folder
 from drakegrasp.protocols.postures import (
     PostureTrials,
     json_line,
     prepare_trials,
+    read_grasp_file,
     verify_postures,
 )
 from drakegrasp.protocols.protocol import find_protocol
+from drakegrasp.protocols.scene import read_object_folder
 
 OWN = """
 from dataclasses import dataclass, replace

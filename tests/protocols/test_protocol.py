@@ -15,7 +15,6 @@ from helpers.jaws import EDGE, HAND, HERE, box_folder, changed, jaws
 from drakegrasp import registry
 from drakegrasp.errors import ConfigError
 from drakegrasp.exchange.dexgraspbench import write_object
-from drakegrasp.protocols.files import ObjectFolder, read_object_folder
 from drakegrasp.protocols.protocol import (
     DexGraspBench,
     DexGraspBenchTabletop,
@@ -25,7 +24,7 @@ from drakegrasp.protocols.protocol import (
     displacement,
     find_protocol,
 )
-from drakegrasp.protocols.scene import ProtocolScene
+from drakegrasp.protocols.scene import ObjectFolder, ProtocolScene, read_object_folder
 
 Judge = Callable[..., PostureVerdict]
 

@@ -23,7 +23,8 @@ from drakegrasp.frames import make_pose, pack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.verification.result_files import json_line, validate_writable, write_results
+from drakegrasp.runtime.files import validate_writable
+from drakegrasp.verification.result import json_line, write_results
 
 CONFIG = load_config()
 RNG = np.random.default_rng(0)
