@@ -26,7 +26,6 @@ from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 
 # Software OpenGL must not start threads beside the test workers, and nothing needs the network.
@@ -118,7 +117,7 @@ def small_dataset(
     """A dataset built in one process, without Dask. Read only: copy it to change it."""
 
     def make(out: Path) -> None:
-        build(find_meshes(small_meshes), out, small_config, run_here, show=False)
+        build(small_meshes, out, small_config)
 
     return made_once("small_dataset", make)
 

@@ -24,8 +24,6 @@ from drakegrasp.cluster import kinds
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
 from drakegrasp.cluster.kinds import cluster_of
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import find_meshes
-from drakegrasp.runtime.executor import run_here
 
 pytestmark = [pytest.mark.server, pytest.mark.cluster, pytest.mark.sim, pytest.mark.slow]
 
@@ -54,7 +52,7 @@ def built_here(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset, by a plain loop in this process."""
     out = tmp_path_factory.mktemp("here") / "out"
     config = load_config(overrides=[f"candidates.max={CANDIDATES}", f"unit_candidates={UNIT}"])
-    build(find_meshes(meshes), out, config, run_here, show=False)
+    build(meshes, out, config)
     return out
 
 

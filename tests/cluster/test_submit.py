@@ -33,8 +33,6 @@ from drakegrasp.cluster.kinds import Jobs, Local, cluster_of
 from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import find_meshes
-from drakegrasp.runtime.executor import run_here
 
 #: A build of a few seconds.
 TINY = ["candidates.max=8", "unit_candidates=4"]
@@ -329,7 +327,7 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
 @pytest.mark.sim
 @pytest.mark.slow
 def test_script_builds_what_a_plain_loop_builds(box: Path, tmp_path: Path) -> None:
-    build(find_meshes(box), tmp_path / "here", load_config(overrides=TINY), run_here, show=False)
+    build(box, tmp_path / "here", load_config(overrides=TINY))
     command = [sys.executable, PIPELINES / "submit_build.py", "--objects", box, *TINY_OPTIONS]
     out, defaults = tmp_path / "out", tmp_path / "defaults.yaml"
     defaults.write_text("seed: 0\n")

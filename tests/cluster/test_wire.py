@@ -34,9 +34,8 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
 from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.executor import WorkerPool, run_here
+from drakegrasp.runtime.executor import WorkerPool
 from drakegrasp.simulation.attempts import Attempts
 
 pytestmark = pytest.mark.cluster
@@ -240,7 +239,7 @@ def test_every_kind_of_task_gives_the_same_bytes(
     client: Client, meshes: Path, out: Path, tmp_path: Path, settings: list[str]
 ) -> None:
     config, here = load_config(overrides=settings), tmp_path / "here"
-    build(find_meshes(meshes), here, config, run_here, show=False)
+    build(meshes, here, config)
     build_by_wire(client, meshes, out, config)
     assert_same_files(here, out)
     with h5py.File(out / "trials.hdf5") as file:
@@ -252,7 +251,7 @@ def build_by_wire(
 ) -> BuildReport:
     with by_wire(DaskExecutor(client), client, out) as execute:
         rest = {"pool": WorkerPool(), "postures": postures, "show": False}
-        return build(find_meshes(meshes), out, config, execute, **rest)
+        return build(meshes, out, config, execute, **rest)
 
 
 @pytest.mark.nightly
@@ -266,7 +265,7 @@ def test_client_that_stopped_goes_on_and_a_killed_worker_changes_nothing(
 ) -> None:
     """The workers have another working directory, so they do not see the dataset."""
     config, here = load_config(overrides=FAST), tmp_path / "here"
-    build(find_meshes(meshes), here, config, run_here, show=False)
+    build(meshes, here, config)
     monkeypatch.chdir(meshes)
     with connect(workers=2) as client:
         monkeypatch.chdir(tmp_path)

@@ -23,14 +23,9 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.still_scene import StillScene, link_surfaces
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.shapes.catalog import builtin_sources
 
 pytestmark = [pytest.mark.sim, needs_egl]
-
-LICENCE = "The Tongs Licence"
-
 
 #: A can of 0.2 kg, at one stand-off; lifts are quick.
 SETTINGS = (
@@ -44,28 +39,15 @@ def go_on(out: Path, hand: Path) -> BuildReport:
     """Begin the build, or go on with it, in this process."""
     config = load_config(overrides=[*SETTINGS, f"hand={hand}"])
     sources = builtin_sources(out / "builtin", config.builtin, only=["6_can_1"])
-    return build(sources, out, config, run_here, show=False)
-
-
-def write_hand(folder: Path) -> Path:
-    """Write the tutorial's hand with a licence."""
-    folder.mkdir(parents=True)
-    (folder / "LICENSE").write_text(f"{LICENCE}\n\nDo as you like.\n")
-    return write_tongs(folder)
-
-
-@pytest.fixture(scope="module")
-def shapes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """What is drawn of the links of the hand."""
-    hand = load_hand(write_hand(tmp_path_factory.mktemp("drawn") / "hand"))
-    return link_surfaces(StillScene(hand))
+    return build(sources, out, config)
 
 
 @pytest.fixture(scope="module")
 def passed_on(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset in another folder than where it was built; the hand is gone."""
     folder = tmp_path_factory.mktemp("passed_on")
-    go_on(folder / "built", write_hand(folder / "hands"))
+    (folder / "hands").mkdir()
+    go_on(folder / "built", write_tongs(folder / "hands"))
     shutil.rmtree(folder / "hands")
     return Path(shutil.move(folder / "built", folder / "received"))
 
@@ -76,13 +58,10 @@ def copy(passed_on: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(passed_on, tmp_path / "copy"))
 
 
-def success(out: Path) -> int:
-    with h5py.File(out / TRIALS_FILE) as file:
-        return int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
-
-
 def test_a_trial_is_replayed_to_the_bit(passed_on: Path) -> None:
-    result = run("replay", passed_on, "--trial", success(passed_on))
+    with h5py.File(passed_on / TRIALS_FILE) as file:
+        success = np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0]
+    result = run("replay", passed_on, "--trial", success)
     assert (result.exit_code, result.stderr) == (0, "")
 
 
@@ -102,26 +81,22 @@ def test_an_export_has_the_palm_of_the_hand(passed_on: Path, tmp_path: Path) -> 
 
 def test_it_names_the_joints_of_the_hand(passed_on: Path) -> None:
     joints = load_hand(read_manifest(passed_on).config.hand_source).joint_names
-    for name, fields in (
-        (TRIALS_FILE, ("trials/closed_q", "trials/lifted_q")),
-        (DATA_FILES["oto"], ("train/grasp_props/q",)),
+    for name, field in (
+        (TRIALS_FILE, "trials/closed_q"),
+        (TRIALS_FILE, "trials/lifted_q"),
+        (DATA_FILES["oto"], "train/grasp_props/q"),
     ):
         with h5py.File(passed_on / name) as file:
             assert json.loads(file.attrs["joints"]) == list(joints)
-            for field in fields:
-                assert file[field].attrs["joints"] == file.attrs["joints"]
+            assert file[field].attrs["joints"] == file.attrs["joints"]
     # No path of the machine that built it is in it.
     assert read_manifest(passed_on).config.hand == "hand/tongs_hand.yaml"
-
-
-def hand_path(out: Path) -> Path:
-    return out / "hand" / "tongs_hand.yaml"
 
 
 def test_a_build_goes_on_with_the_same_hand_from_elsewhere(copy: Path, tmp_path: Path) -> None:
     """Its name does not matter either."""
     before = (copy / TRIALS_FILE).read_bytes()
-    hand = write_hand(tmp_path / "elsewhere")
+    hand = write_tongs(tmp_path)
     renamed = hand.rename(hand.with_name("pliers.yaml"))
     report = go_on(copy, renamed)
     assert (report.simulated, report.reused, report.assembled) == (0, 1, False)
@@ -129,15 +104,12 @@ def test_a_build_goes_on_with_the_same_hand_from_elsewhere(copy: Path, tmp_path:
 
 
 def test_a_build_does_not_go_on_with_a_changed_hand(copy: Path, tmp_path: Path) -> None:
-    hand = write_hand(tmp_path / "elsewhere")
+    hand = write_tongs(tmp_path)
     known = hand_digest(hand)
     hand.write_text(hand.read_text().replace("payload: 1.5", "payload: 1.4"))
-    with pytest.raises(
-        DataError, match=f"continued with hand {known}, which made it, got "
-    ) as said:
+    with pytest.raises(DataError, match=f"^.*continued with hand {known}, which made it, got .*$"):
         go_on(copy, hand)
-    assert "\n" not in str(said.value)
-    assert hand_digest(hand_path(copy)) == known
+    assert hand_digest(copy / "hand" / "tongs_hand.yaml") == known
 
 
 def test_a_damaged_copy_is_found_refused_and_made_again(copy: Path, tmp_path: Path) -> None:
@@ -148,5 +120,5 @@ def test_a_damaged_copy_is_found_refused_and_made_again(copy: Path, tmp_path: Pa
     assert found.exit_code == 1
     assert "hand: the hand must be that of manifest.json" in found.output
     assert "must hold the hand of the dataset" in error_line(run("replay", copy, "--trial", 0))
-    go_on(copy, write_hand(tmp_path / "elsewhere"))
+    go_on(copy, write_tongs(tmp_path))
     assert model.read_text() == whole

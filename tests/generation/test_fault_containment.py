@@ -25,10 +25,9 @@ from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.generation import attempts
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import host_label
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.journal import Journal, Verdict
 from drakegrasp.vision import rendering
 
@@ -54,7 +53,7 @@ def config() -> Config:
 def undisturbed(meshes: Path, config: Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset, built in this process. Read only: copy it to harm it."""
     out = tmp_path_factory.mktemp("undisturbed") / "out"
-    build(find_meshes(meshes), out, config, run_here, show=False)
+    build(meshes, out, config)
     assert count_funnel(out).outcomes[:, Outcome.SUCCESS].sum() > 0
     return out
 
@@ -84,7 +83,7 @@ def test_random_kills_change_nothing(meshes: Path, tmp_path: Path) -> None:
     more, units, kills = "candidates.max=14", 28, 20
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
     config = load_config(overrides=[*FAST, more])
-    build(find_meshes(meshes), undisturbed, config, run_here, show=False)
+    build(meshes, undisturbed, config)
     process, rng, killed = start_build(meshes, out, 4, "--set", more), random.Random(0), 0
     while not list(out.glob("objects/*.journal")):
         assert process.poll() is None
@@ -143,7 +142,7 @@ def test_objects_are_prepared_once_whatever_died(
     out = tmp_path / "out"
     begin(out, undisturbed, units=0)
     monkeypatch.setattr("drakegrasp.generation.prepare.prepare", prepare)
-    build(find_meshes(meshes), out, config, run_here, show=False)
+    build(meshes, out, config)
     assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
     assert_same_dataset(undisturbed, out)
 
@@ -196,7 +195,7 @@ def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     assert errors == ""
     assert [entry.name for entry in read_manifest(out).objects] == ["2_box_b"]
     assert_clean(out)
-    build(find_meshes(meshes), out, load_config(overrides=[*FAST, few[1]]), run_here, show=False)
+    build(meshes, out, load_config(overrides=[*FAST, few[1]]))
     assert [entry.name for entry in read_manifest(out).objects] == ["1_box_a", "2_box_b"]
     assert not read_manifest(out).refused
 
@@ -254,7 +253,7 @@ def test_what_is_harmed_is_named_and_run_again(
         path.write_bytes(b"half")
     os.utime(old, (0, 0))
     (out / "build.lock").write_text("process 5 on h, since s")
-    report = build(find_meshes(meshes), out, config, run_here, show=False)
+    report = build(meshes, out, config)
     assert (report.simulated, report.reused) == (4, UNITS - 4)
     taken, swept, damaged = report.notices
     assert taken == "the lock of a dead build was taken over: process 5 on h, since s"
@@ -292,7 +291,7 @@ def test_full_disk_of_the_client_is_one_error(
 
     monkeypatch.setattr("drakegrasp.dataset.manifest.write_atomic", full)
     with pytest.raises(DiskFullError, match=r"disk or the quota is full .* continues from here"):
-        build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
+        build(meshes, tmp_path / "out", config)
     assert not (tmp_path / "out").exists()
 
 
@@ -312,7 +311,7 @@ def test_blank_image_never_becomes_data(
     with monkeypatch.context() as patch:
         patch.setattr(attempts, "render", blank)
         with pytest.raises(BlankImageError, match="must not be blank"):
-            build(find_meshes(meshes), out, config, run_here, show=False)
+            build(meshes, out, config)
     assert not shard.exists()
-    build(find_meshes(meshes), out, config, run_here, show=False)
+    build(meshes, out, config)
     assert_same_dataset(undisturbed, out)

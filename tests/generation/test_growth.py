@@ -15,8 +15,6 @@ from helpers.meshes import write
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import find_meshes
-from drakegrasp.runtime.executor import run_here
 
 #: An attempt in any dataset: its object, resting pose, palm pose and stand-off.
 Identity: TypeAlias = tuple[str, int, int, int]
@@ -32,7 +30,7 @@ def grown(folder: Path, out: Path, names: list[str], samples: int) -> None:
     for name in names:
         write(folder / f"{name}.obj", trimesh.creation.box(BOXES[name]).subdivide())
     config = load_config("fast", [*SMALL, f"samples={samples}"])
-    build(find_meshes(folder), out, config, run_here, show=False)
+    build(folder, out, config)
 
 
 def rows(out: Path) -> tuple[dict[Identity, Row], dict[tuple[str, Identity], tuple[str, Row]]]:

@@ -19,7 +19,6 @@ from drakegrasp.generation.prepare import PrepareTask, prepare_one
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.journal import HUNG_DEATHS
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow, pytest.mark.nightly]
@@ -95,7 +94,7 @@ def test_screen_that_hangs_ends_and_is_named(
     sources: list[MeshSource], config: Config, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    build(sources[:1], out, config, run_here, show=False)
+    build(sources[:1], out, config)
     manifest = read_manifest(out)
     (header,) = manifest.headers()
     header.path(out).unlink()

@@ -14,13 +14,7 @@ import pytest
 from helpers import datasets
 from helpers.assertions import assert_same_arrays
 from helpers.builds import build
-from helpers.datasets import (
-    BOTH,
-    BOXES,
-    TRIALS,
-    edit_manifest,
-    make_dataset,
-)
+from helpers.datasets import BOTH, BOXES, TRIALS, edit_manifest, make_dataset
 from helpers.meshes import write_fixed
 
 from drakegrasp.dataset.assemble import assemble
@@ -35,21 +29,9 @@ from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.snapshot import read_snapshot
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.files import seal
 
 NAMES = list(BOXES)
-
-
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small dataset of boxes. Read only."""
-    return make_dataset(tmp_path_factory.mktemp("sound"), tmp_path_factory.mktemp("meshes"))
-
-
-@pytest.fixture
-def copy(sound: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(sound, tmp_path / "copy"))
 
 
 def half(whole: Path, out: Path, places: slice) -> Path:
@@ -106,15 +88,15 @@ def test_a_hand_counts_by_its_files_and_not_by_their_folder(
     assert check_dataset(tmp_path / "into") == []
 
 
-def test_the_same_again_is_taken_once(sound: Path, copy: Path, tmp_path: Path) -> None:
-    merge(tmp_path / "once", [sound, copy])
+def test_the_same_again_is_taken_once(sound: Path, out: Path, tmp_path: Path) -> None:
+    merge(tmp_path / "once", [sound, out])
     assert_same_arrays(tmp_path / "once" / TRIALS, sound / TRIALS)
 
 
-def test_rejections_stay_and_are_inspected(sound: Path, copy: Path, tmp_path: Path) -> None:
+def test_rejections_stay_and_are_inspected(sound: Path, out: Path, tmp_path: Path) -> None:
     key = AttemptKey(NAMES[0], 0, 0)
-    assemble(copy, rejected=[key])
-    merge(tmp_path / "into", [sound, copy])
+    assemble(out, rejected=[key])
+    merge(tmp_path / "into", [sound, out])
     assert read_manifest(tmp_path / "into").rejected == (key,)
     assert check_dataset(tmp_path / "into") == []
     state = read_snapshot(tmp_path / "into")
@@ -126,91 +108,79 @@ def test_rejections_stay_and_are_inspected(sound: Path, copy: Path, tmp_path: Pa
 # What is refused
 
 
-def with_manifest(edit: Callable[[dict], object]) -> Callable[[Path, Path], list[Path]]:
-    """Return two datasets, the second with another manifest, of which its files are."""
+def changed(edit: Callable[[dict], object]) -> Callable[[Path], None]:
+    """Return what gives a dataset, and its files, another manifest."""
 
-    def spoil(sound: Path, copy: Path) -> list[Path]:
-        edit_manifest(copy, edit)
-        return [sound, signed(copy)]
+    def change(out: Path) -> None:
+        edit_manifest(out, edit)
+        sign(out)
 
-    return spoil
+    return change
 
 
-def signed(out: Path) -> Path:
-    """Return a dataset whose files are now said to be of its manifest."""
+def built_with(override: str) -> Callable[[Path], None]:
+    def change(out: Path) -> None:
+        manifest = read_manifest(out)
+        config = override_config(manifest.config, [override])
+        write_manifest(replace(manifest, config=config), out)
+        sign(out)
+
+    return change
+
+
+def sign(out: Path) -> None:
+    """Let the files of a dataset be of its manifest."""
     for name in (*BOTH, TRIALS):
         with h5py.File(out / name, "r+") as file:
             file.attrs["signature"] = read_manifest(out).signature()
-    return out
 
 
-def built_with(override: str) -> Callable[[Path, Path], list[Path]]:
-    def say(sound: Path, copy: Path) -> list[Path]:
-        manifest = read_manifest(copy)
-        config = override_config(manifest.config, [override])
-        write_manifest(replace(manifest, config=config), copy)
-        return [sound, signed(copy)]
-
-    return say
+def a_shard(out: Path) -> Path:
+    return next((out / "shards" / NAMES[1]).iterdir())
 
 
-def with_another_shard(sound: Path, copy: Path) -> list[Path]:
-    path = next((copy / "shards" / NAMES[1]).iterdir())
-    with h5py.File(path, "r+") as file:
+def with_another_shard(out: Path) -> None:
+    with h5py.File(a_shard(out), "r+") as file:
         file["trials/time_close"][0] += 1e-6
-    seal(path)
-    assemble(copy)
-    return [sound, copy]
-
-
-def without_a_shard(sound: Path, copy: Path) -> list[Path]:
-    next((copy / "shards" / NAMES[1]).iterdir()).unlink()
-    return [sound, copy]
-
-
-def not_assembled(sound: Path, copy: Path) -> list[Path]:
-    (copy / TRIALS).unlink()
-    return [sound, copy]
+    seal(a_shard(out))
+    assemble(out)
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("change", "said"),
     [
         (
             built_with("physics.friction_hand=0.5"),
             "differs in physics.friction_hand (0.71 there, 0.5 here)",
         ),
-        (built_with("camera.fov_y_deg=40.0"), "differs in camera.fov_y_deg"),
-        (built_with("candidates.max=99"), "differs in candidates.max"),
         (built_with("filters.max_slip=0.004"), "differs in filters.max_slip"),
-        (with_manifest(lambda m: m["versions"].update(drake="1.0")), "must be of drake "),
-        (with_manifest(lambda m: m["versions"].update(hand="0")), "must be of hand "),
-        (with_manifest(lambda m: m["versions"].update(drakegrasp="0.1")), "be of drakegrasp "),
-        (with_manifest(lambda m: m["objects"][1].update(mass=0.5)), "got others in mass"),
-        (with_another_shard, f"shards/{NAMES[1]}/"),
-        (without_a_shard, "must be a complete shard, got none"),
-        (not_assembled, "must be a complete dataset"),
         (built_with("seed=1"), "differs in seed"),
+        (changed(lambda m: m["versions"].update(drake="1.0")), "must be of drake "),
+        (changed(lambda m: m["versions"].update(hand="0")), "must be of hand "),
+        (changed(lambda m: m["objects"][1].update(mass=0.5)), "got others in mass"),
+        (with_another_shard, f"shards/{NAMES[1]}/"),
+        (lambda out: a_shard(out).unlink(), "must be a complete shard, got none"),
+        (lambda out: (out / TRIALS).unlink(), "must be a complete dataset"),
     ],
 )
 def test_what_differs_is_named_and_refused(
-    make: Callable[[Path, Path], list[Path]], said: str, sound: Path, copy: Path
+    change: Callable[[Path], None], said: str, sound: Path, out: Path
 ) -> None:
-    outs = make(sound, copy)
-    before = files_of(outs[1])
+    change(out)
+    before = files_of(out)
     with pytest.raises(DataError) as caught:
-        merge(copy.parent / "into", outs)
+        merge(out.parent / "into", [sound, out])
     assert said in str(caught.value)
-    assert str(outs[1]) in str(caught.value)
+    assert str(out) in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert files_of(outs[1]) == before
+    assert files_of(out) == before
     # Nothing is left of the merged dataset.
-    assert not [path for path in copy.parent.iterdir() if "into" in path.name]
+    assert not [path for path in out.parent.iterdir() if "into" in path.name]
 
 
-def test_a_directory_in_use_is_refused(sound: Path, copy: Path) -> None:
+def test_a_directory_in_use_is_refused(sound: Path, out: Path) -> None:
     with pytest.raises(DataError, match="must be a new or empty directory"):
-        merge(copy, [sound])
+        merge(out, [sound])
 
 
 @pytest.mark.nightly
@@ -225,27 +195,16 @@ def test_merged_builds_replay_bit_equal(tmp_path: Path) -> None:
         *("objects.resting_poses=2", "filters.outlier_sigma=0", "filters.require=held"),
         "physics.friction_hand=1.5",
     ]
+    config = load_config("randomized", overrides=drawn)
     outs = [tmp_path / "first", tmp_path / "second"]
     for out, own in zip(outs, (sources[:1], sources[1:]), strict=True):
-        build(own, out, load_config("randomized", overrides=drawn), run_here, show=False)
-    build(
-        sources,
-        tmp_path / "whole",
-        load_config("randomized", overrides=drawn),
-        run_here,
-        show=False,
-    )
+        build(own, out, config)
+    build(sources, tmp_path / "whole", config)
 
     # Halves by objects are the whole, may be built on, and replay.
-    merge(tmp_path / "halves", outs[:2])
+    merge(tmp_path / "halves", outs)
     assert_same_arrays(tmp_path / "halves" / TRIALS, tmp_path / "whole" / TRIALS)
-    report = build(
-        sources,
-        tmp_path / "halves",
-        load_config("randomized", overrides=drawn),
-        run_here,
-        show=False,
-    )
+    report = build(sources, tmp_path / "halves", config)
     assert (report.simulated, report.assembled) == (0, False)
     with h5py.File(tmp_path / "halves" / TRIALS) as file:
         owner, outcome = (file["trials"][key][:] for key in ("object", "outcome"))

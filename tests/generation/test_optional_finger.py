@@ -16,9 +16,7 @@ from drakegrasp.filters import Removal
 from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import find_meshes
 from drakegrasp.page.snapshot import read_snapshot
-from drakegrasp.runtime.executor import run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -41,7 +39,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> BuildReport:
             *("candidates.standoffs=[0.06]", "camera.size=32"),
         ],
     )
-    return build(find_meshes(folder / "meshes"), folder / "out", config, run_here, show=False)
+    return build(folder / "meshes", folder / "out", config)
 
 
 def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(

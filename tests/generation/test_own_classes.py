@@ -35,7 +35,6 @@ from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.page.app import Inspection, make_app
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.candidates import Candidates, Drawing, palm_attempts
 
@@ -289,7 +288,7 @@ def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
         "filters.own=[my_filter.py:Wide, half.py:Half]",
     ]
     config = load_config(overrides=[*rules, *settings])
-    report = build(sources, out, config, run_here, show=False)
+    report = build(sources, out, config)
     removed = report.assembly.removed
     assert removed[Removal.OWN] == removed[Removal.KEPT] > 0
     assert [str(v) for v in check_dataset(out)] == []
@@ -305,11 +304,11 @@ def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
     with pytest.raises(ConfigError, match=r"my_filter\.py:Wide@.* must be given again"):
         assemble(out, overrides=["filters.max_slip=null"])
     with pytest.raises(ConfigError, match=r"my_sampler\.py:Ring@.* must be given again"):
-        build(sources, out, read_manifest(out).config, run_here, show=False)
+        build(sources, out, read_manifest(out).config)
     assert Removal.OWN not in assemble(out, overrides=["filters.own=null"]).removed
 
     # With another file it is another dataset.
     (own / "my_sampler.py").write_text((own / "my_sampler.py.txt").read_text() + "\n")
     other = load_config(overrides=[*rules, settings[0]])
     with pytest.raises(DataError, match=r"candidates\.method \(\['my_sampler\.py:Ring@.* there, "):
-        build(sources, out, other, run_here, show=False)
+        build(sources, out, other)

@@ -73,7 +73,7 @@ def again(small_meshes: Path, small_config: Config) -> Again:
         meshes: Path = small_meshes,
         config: Config = small_config,
     ) -> BuildReport:
-        return build(find_meshes(meshes), out, config, execute, show=False)
+        return build(meshes, out, config, execute)
 
     return build_again
 
@@ -204,13 +204,13 @@ def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
     (meshes / "3_text_a.obj").write_text("no mesh at all\n")
     out = tmp_path / "out"
     config = load_config(overrides=FAR)
-    report = build(find_meshes(meshes), out, config, run_here, show=False)
+    report = build(meshes, out, config)
     assert report.objects == 1
     assert [entry.name for entry in report.refused] == ["2_house_a", "3_text_a"]
     assert "--units" in report.refused[0].reason
     # Each has its name beside the reason, once.
     assert not any("2_house_a" in e.reason or "3_text_a" in e.reason for e in report.refused)
-    again = build(find_meshes(meshes), out, config, _nothing_runs, show=False)
+    again = build(meshes, out, config, _nothing_runs)
     assert again.refused == report.refused
 
 
@@ -221,7 +221,7 @@ def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:
         trimesh.creation.box([0.06, 0.06, 0.09]).export(meshes / f"{name}.obj")
     out = tmp_path / "Daten ü"
     config = load_config(overrides=FAR)
-    build(find_meshes(meshes), out, config, run_here, show=False)
+    build(meshes, out, config)
     assert count_funnel(out).names == ("1_чашка большая_a", "2_crème brûlée_b")
     assert count_funnel(out).classes == ("чашка большая", "crème brûlée")
     assert [str(v) for v in check_dataset(out)] == []
@@ -230,7 +230,7 @@ def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:
 def test_somebody_elses_directory_is_refused(tmp_path: Path, small_meshes: Path) -> None:
     (tmp_path / "letter.txt").write_text("dear Ada")
     with pytest.raises(DataError, match="must be empty or hold a dataset"):
-        build(find_meshes(small_meshes), tmp_path, load_config(), run_here, show=False)
+        build(small_meshes, tmp_path, load_config())
     assert [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
 
 
@@ -268,7 +268,7 @@ def test_repeats_come_with_the_samples_and_change_none(
 ) -> None:
     """Of one object, whose attempts do not depend on the others."""
     config = override_config(small_config, ["robustness.repeats=2"])
-    build([find_meshes(small_meshes)[1]], tmp_path / "out", config, run_here, show=False)
+    build([find_meshes(small_meshes)[1]], tmp_path / "out", config)
     with (
         h5py.File(tmp_path / "out" / "trials.hdf5", "r") as file,
         h5py.File(small_dataset / "trials.hdf5", "r") as plain,

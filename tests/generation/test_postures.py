@@ -33,7 +33,6 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.attempts import Attempts, make_attempts, unknown_objects
 from drakegrasp.simulation.construction import build_scene
@@ -87,7 +86,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
 
 def built(meshes: Path, out: Path, table: Attempts, config: Config | None = None) -> Path:
     config = build_config(config or CONFIG, table)
-    build(find_meshes(meshes), out, config, run_here, postures=table, show=False)
+    build(meshes, out, config, postures=table)
     return out
 
 
@@ -161,7 +160,7 @@ def test_rows_that_are_no_posture_are_told_and_spoil_no_other(meshes, table, dat
     )
     mixed = mixed.refuse(unknown_objects(mixed, [NAME]))
     config = build_config(CONFIG, mixed)
-    report = build(find_meshes(meshes), tmp_path, config, run_here, postures=mixed, show=False)
+    report = build(meshes, tmp_path, config, postures=mixed)
     trials, alone = Trials(tmp_path), Trials(dataset)
     assert trials["posture_row"].tolist() == [0.0, 3.0]
     for name in ("outcome", "closed_q", "slip"):

@@ -13,7 +13,6 @@ from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.runtime.executor import run_here
 
 pytestmark = pytest.mark.sim
 
@@ -25,7 +24,7 @@ SMALL = ("candidates.max=6", "unit_candidates=3", "camera.size=32", "objects.res
 def test_small_set_of_a_preset_is_sound(preset: str, small_meshes: Path, tmp_path: Path) -> None:
     sources = [source for source in find_meshes(small_meshes) if "box" in source.name][:1]
     out = tmp_path / "out"
-    build(sources, out, load_config(preset, overrides=SMALL), run_here, show=False)
+    build(sources, out, load_config(preset, overrides=SMALL))
     assert len(Trials(out)) > 0
     assert [str(violation) for violation in check_dataset(out)] == []
     assert broken_physics(out) == {}

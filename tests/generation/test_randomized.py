@@ -20,7 +20,6 @@ from drakegrasp.generation.replay import record_trial, replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.executor import run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -44,7 +43,7 @@ def randomized(
 ) -> Path:
     """The dataset. Read only."""
     out = tmp_path_factory.mktemp("randomized") / "out"
-    build(sources, out, config, run_here, show=False)
+    build(sources, out, config)
     return out
 
 

@@ -21,7 +21,6 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.executor import run_here
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -55,7 +54,7 @@ def dataset(
     made_once: Callable[[str, Callable[[Path], object]], Path],
 ) -> Path:
     """The dataset. Read only."""
-    return made_once("resting poses", lambda out: build(sources, out, config, run_here, show=False))
+    return made_once("resting poses", lambda out: build(sources, out, config))
 
 
 def trials(out: Path) -> dict[str, np.ndarray]:

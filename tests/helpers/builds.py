@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from helpers import faults
 
@@ -17,8 +16,8 @@ from drakegrasp.config import Config
 from drakegrasp.generation import pipeline
 from drakegrasp.generation.directory import build_config, open_directory
 from drakegrasp.generation.pipeline import BuildReport
-from drakegrasp.objects.sources import MeshSource
-from drakegrasp.runtime.executor import Executor
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.runtime.executor import Executor, WorkerPool, run_here
 from drakegrasp.simulation.attempts import Attempts
 
 #: Six units of half a second for each object, so that none goes with another and a build can be
@@ -44,18 +43,20 @@ FAST = [
 
 
 def build(
-    sources: Sequence[MeshSource],
+    objects: Path | Sequence[MeshSource],
     out: Path,
     config: Config,
-    execute: Executor,
+    execute: Executor = run_here,
     *,
     postures: Attempts | None = None,
-    **options: Any,
+    pool: WorkerPool | None = None,
+    show: bool = False,
 ) -> BuildReport:
-    """Build the dataset of some meshes in a directory."""
+    """Build the dataset of a folder of meshes, or of some of them, in a directory."""
+    sources = find_meshes(objects) if isinstance(objects, Path) else objects
     config = build_config(config, postures)
     with open_directory(out, config, [source.name for source in sources]) as directory:
-        return pipeline.build(directory, sources, execute, postures=postures, **options)
+        return pipeline.build(directory, sources, execute, postures=postures, pool=pool, show=show)
 
 
 def start_build(
@@ -84,21 +85,13 @@ def start_build(
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
 
-    command = [
-        sys.executable,
-        "-c",
-        "from drakegrasp.cli.main import main; main()",
-        "build",
-        "--quiet",
-    ]
-    command += ["--objects", str(meshes), "--out", str(out), "--workers", str(workers)]
     # The defaults, which have no name; a build without a configuration uses the preset fast.
     defaults = out.parent / "defaults.yaml"
     defaults.write_text("seed: 0\n")
-    command += ["--config", str(defaults)]
-    for value in FAST:
-        command += ["--set", value]
-    command += arguments
+    options = ["--objects", meshes, "--out", out, "--workers", workers, "--config", defaults]
+    settings = [word for value in FAST for word in ("--set", value)]
+    command = [sys.executable, "-c", "from drakegrasp.cli.main import main; main()"]
+    command += ["build", "--quiet", *map(str, options), *settings, *arguments]
     environment = faults.environment(fault) if fault else None
     return subprocess.Popen(
         command,
