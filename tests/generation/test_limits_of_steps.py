@@ -40,10 +40,10 @@ for _ in range(int(sys.argv[1])):
 """
 
 
-def die(function: object, task: object, fault: str, times: int, seconds: float) -> None:
-    """Let processes die of a fault in a task."""
+def die_of_hanging(function: object, task: object, fault: str, seconds: float) -> None:
+    """Let processes hang in a task, as often as it takes."""
     run = subprocess.run(
-        [sys.executable, "-c", CHILD, str(times), str(seconds)],
+        [sys.executable, "-c", CHILD, str(HUNG_DEATHS), str(seconds)],
         input=pickle.dumps((function, task)),
         env=faults.environment(fault),
         capture_output=True,
@@ -51,14 +51,14 @@ def die(function: object, task: object, fault: str, times: int, seconds: float) 
         timeout=120,
     )
     codes = list(map(int, run.stdout.split()))
-    assert len(codes) == times and 0 not in codes, (codes, run.stderr)
+    assert len(codes) == HUNG_DEATHS and 0 not in codes, (codes, run.stderr)
 
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> list[MeshSource]:
     folder = tmp_path_factory.mktemp("meshes")
-    trimesh.creation.box([0.06, 0.05, 0.12]).export(folder / "1_box_a.obj")
-    trimesh.creation.box([0.07, 0.05, 0.14]).export(folder / "2_box_b.obj")
+    for name in ("1_box_a", "2_box_b"):
+        trimesh.creation.box([0.06, 0.05, 0.12]).export(folder / f"{name}.obj")
     return find_meshes(folder)
 
 
@@ -67,25 +67,18 @@ def config() -> Config:
     return load_config(overrides=["candidates.max=1", "settle.drop_height=0.01"])
 
 
-def prepare_tasks(sources: list[MeshSource], out: Path, config: Config) -> list[PrepareTask]:
-    return [
-        PrepareTask(source=source, out=out, config=config, restartable=True) for source in sources
-    ]
-
-
 @pytest.mark.parametrize("fault", ["freeze", "spin"])
 def test_mesh_whose_preparing_hangs_is_refused_and_the_other_is_not(
     fault: str, sources: list[MeshSource], config: Config, tmp_path: Path
 ) -> None:
-    guilty, innocent = prepare_tasks(sources, tmp_path / "out", config)
-    die(prepare_one, guilty, f"{fault}:1_box_a", HUNG_DEATHS, seconds=0.3)
-    name, entry = prepare_one(guilty)
-    assert isinstance(entry, RefusedMesh)
-    assert (name, entry.reason, entry.again) == (
-        "1_box_a",
-        "preparing it passed its time limit",
-        False,
+    guilty, innocent = (
+        PrepareTask(source=source, out=tmp_path / "out", config=config, restartable=True)
+        for source in sources
     )
+    die_of_hanging(prepare_one, guilty, f"{fault}:1_box_a", seconds=0.3)
+    _, entry = prepare_one(guilty)
+    assert isinstance(entry, RefusedMesh)
+    assert (entry.reason, entry.again) == ("preparing it passed its time limit", False)
     assert isinstance(prepare_one(innocent)[1], ObjectEntry)
     assert not list(tmp_path.rglob("*.journal"))
 
@@ -100,6 +93,6 @@ def test_screen_that_hangs_ends_and_is_named(
     header.path(out).unlink()
     unit = WorkUnit(out=out, header=header, config=manifest.config, restartable=True)
     # Building the scene has the same limit, and takes a second of computing.
-    die(run_unit, unit, "spin:1_box_a:predict", HUNG_DEATHS, seconds=2.0)
+    die_of_hanging(run_unit, unit, "spin:1_box_a:predict", seconds=2.0)
     with pytest.raises(MachineError, match=r"predicting its attempts passed its time limit"):
         run_unit(unit)
