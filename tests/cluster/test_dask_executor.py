@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -12,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 from distributed import Client, KilledWorker, LocalCluster
+from server.processes import dask_scheduler
 
 from drakegrasp.cluster import executor as tasks
 from drakegrasp.cluster.connect import connect
@@ -22,14 +21,15 @@ from drakegrasp.vision import rendering
 pytestmark = pytest.mark.cluster
 
 
+def small_cluster(workers: int) -> LocalCluster:
+    """Return a cluster in this process."""
+    there = {"threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    return LocalCluster(n_workers=workers, **there)
+
+
 @pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
-    with (
-        LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    with small_cluster(2) as cluster, Client(cluster) as client:
         yield client
 
 
@@ -88,10 +88,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def cluster() -> Iterator[LocalCluster]:
-    """A cluster of one worker, in this process."""
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-    ) as cluster:
+    with small_cluster(1) as cluster:
         yield cluster
 
 
@@ -126,27 +123,13 @@ def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
 
 @pytest.mark.nightly
 def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
-    command, file = [sys.executable, "-m"], tmp_path / "scheduler.json"
-    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    scheduler = subprocess.Popen(
-        [*command, "distributed.cli.dask_scheduler", *options, "--scheduler-file", str(file)],
-        stderr=subprocess.DEVNULL,
-    )
-    worker = subprocess.Popen(
-        [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file), "--no-nanny"],
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        while not file.exists():
-            time.sleep(0.1)
-        with connect(scheduler_file=file, tls=False) as client:
-            client.wait_for_workers(1, timeout=60)
-            results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
-            assert [next(results), next(results)] == [None, None]
-            scheduler.kill()
-            with pytest.raises(MachineError, match=r"the scheduler was lost: .*; the same"):
-                next(results)
-    finally:
-        for process in (worker, scheduler):
-            process.kill()
-            process.wait(60)
+    with (
+        dask_scheduler(tmp_path) as (scheduler, _),
+        connect(scheduler_file=tmp_path / "scheduler.json", tls=False) as client,
+    ):
+        client.wait_for_workers(1, timeout=60)
+        results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
+        assert [next(results), next(results)] == [None, None]
+        scheduler.kill()
+        with pytest.raises(MachineError, match=r"the scheduler was lost: .*; the same"):
+            next(results)

@@ -25,6 +25,7 @@ from helpers.commands import Result
 from helpers.commands import run as run_command
 from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
+from server.processes import dask_scheduler
 
 import drakegrasp
 from drakegrasp import registry
@@ -284,42 +285,23 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     def environment() -> dict[str, str | None]:
         return {name: os.environ.get(name) for name in names}
 
-    command = [sys.executable, "-m"]
-    file = tmp_path / "scheduler.json"
     plain = {k: v for k, v in os.environ.items() if k not in WORKER_ENVIRONMENT}
-    flags = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    (tmp_path / "keys").mkdir()
-    files = make_certificates(tmp_path / "keys")
+    files = make_certificates(tmp_path)
     given = zip(("ca-file", "cert", "key"), map(str, files), strict=True)
     tls = [word for name, path in given for word in (f"--tls-{name}", path)]
-    scheduler = subprocess.Popen(
-        [
-            *(*command, "distributed.cli.dask_scheduler", *flags, "--scheduler-file", str(file)),
-            *(*tls, "--protocol", "tls"),
-        ],
-        env=plain,
-        stderr=subprocess.DEVNULL,
-    )
-    join = [*command, "distributed.cli.dask_worker", *tls, "--scheduler-file", str(file)]
-    worker = subprocess.Popen([*join, "--nthreads", "1"], env=plain, stderr=subprocess.DEVNULL)
-    try:
-        while not file.exists():
-            scheduler.poll()
-            assert scheduler.returncode is None
-        with connect(scheduler_file=file, tls_files=files) as client:
-            client.wait_for_workers(1, timeout=60)
-            with checked_workers(client, load_config()):
-                assert client.run_on_scheduler(saturation) == 1.0
-                ((address, found),) = client.run(environment).items()
-                assert found == WORKER_ENVIRONMENT
-                late = [*join, "--nthreads", "2"]
-                refused = subprocess.run(late, env=plain, stderr=subprocess.PIPE, timeout=120)
-                assert b"drakegrasp-unfit" in refused.stderr
-                assert list(client.nthreads()) == [address]
-    finally:
-        for process in (worker, scheduler):
-            process.terminate()
-            process.wait(60)
+    with (
+        dask_scheduler(tmp_path, *tls, "--protocol", "tls", env=plain) as (_, join),
+        connect(scheduler_file=tmp_path / "scheduler.json", tls_files=files) as client,
+    ):
+        client.wait_for_workers(1, timeout=60)
+        with checked_workers(client, load_config()):
+            assert client.run_on_scheduler(saturation) == 1.0
+            ((address, found),) = client.run(environment).items()
+            assert found == WORKER_ENVIRONMENT
+            late = [*join, "--nthreads", "2"]
+            refused = subprocess.run(late, env=plain, stderr=subprocess.PIPE, timeout=120)
+            assert b"drakegrasp-unfit" in refused.stderr
+            assert list(client.nthreads()) == [address]
 
 
 @pytest.mark.nightly

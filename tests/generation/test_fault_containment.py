@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -19,13 +20,11 @@ from helpers.builds import FAST, build, finish, start_build, wait_for_shards, wo
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.generation import attempts
 from drakegrasp.generation.work_unit import WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.journal import Journal, Verdict
@@ -135,13 +134,9 @@ def test_objects_are_prepared_once_whatever_died(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The manifest names them when all are; a client that dies before loses none of them."""
-
-    def prepare(source: MeshSource, config: Config) -> PreparedObject:
-        raise AssertionError(f"{source.name} is prepared again")
-
     out = tmp_path / "out"
     begin(out, undisturbed, units=0)
-    monkeypatch.setattr("drakegrasp.generation.prepare.prepare", prepare)
+    monkeypatch.setattr("drakegrasp.generation.prepare.prepare", None)
     build(meshes, out, config)
     assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
     assert_same_dataset(undisturbed, out)
@@ -162,11 +157,8 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
     assert "refused: 3_box_c: preparing it crashed its process" in said
     assert errors == ""
-    failing = {
-        (0, 3, 1): Outcome.CRASHED,
-        (0, 5, 0): Outcome.TIMEOUT,
-        (1, 4, 2): Outcome.TIMEOUT,
-    }
+    crashed, timeout = Outcome.CRASHED, Outcome.TIMEOUT
+    failing = {(0, 3, 1): crashed, (0, 5, 0): timeout, (1, 4, 2): timeout}
     with h5py.File(undisturbed / "trials.hdf5") as a, h5py.File(out / "trials.hdf5") as b:
         names = ("object", "candidate", "standoff_index")
         places = list(zip(*(a["trials"][n][:].tolist() for n in names), strict=True))
@@ -190,8 +182,7 @@ def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     out = tmp_path / "out"
     few = ("--set", "candidates.max=1")
     said, errors = finish(start_build(meshes, out, 1, *few, fault="exit:1_box_a"))
-    line = "refused: 1_box_a: preparing it was at work whenever its process vanished"
-    assert line in said
+    assert "refused: 1_box_a: preparing it was at work whenever its process vanished" in said
     assert errors == ""
     assert [entry.name for entry in read_manifest(out).objects] == ["2_box_b"]
     assert_clean(out)
@@ -208,9 +199,8 @@ def test_every_step_of_a_unit_is_in_its_journal(
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     header = next(read_manifest(out).headers())
     header.path(out).unlink()
-    monkeypatch.setattr(
-        Journal, "verdict", lambda self, name: Verdict.HUNG if name == step else None
-    )
+    verdict = {step: Verdict.HUNG}.get
+    monkeypatch.setattr(Journal, "verdict", lambda _, name: verdict(name))
     config = read_manifest(out).config
     with pytest.raises(MachineError, match=r"1_box_a: .*passed its time limit"):
         run_unit(WorkUnit(out=out, header=header, config=config, restartable=True))
@@ -219,30 +209,18 @@ def test_every_step_of_a_unit_is_in_its_journal(
 # Faults found on start
 
 
-def _cut(shard: Path) -> None:
-    shard.write_bytes(shard.read_bytes()[:-100])
-
-
-def _flip(shard: Path) -> None:
-    content = bytearray(shard.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    shard.write_bytes(bytes(content))
-
-
-def _exchange(shard: Path) -> None:
-    """Put another object's shard in its place."""
-    other = next(p for p in shard.parent.parent.glob(f"*/{shard.name}") if p != shard)
-    shutil.copyfile(other, shard)
-
-
 def test_what_is_harmed_is_named_and_run_again(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path
 ) -> None:
+    """Shards that are cut off, changed, of another object, and missing; what the dead left."""
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     shards = sorted(out.glob("shards/*/*.h5"))
-    harms = (_cut, _flip, _exchange, Path.unlink)
-    for harm, shard in zip(harms, shards, strict=False):
-        harm(shard)
+    shards[0].write_bytes(shards[0].read_bytes()[:-100])
+    content = bytearray(shards[1].read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    shards[1].write_bytes(bytes(content))
+    shutil.copyfile(out / "shards" / "2_box_b" / shards[2].name, shards[2])
+    shards[3].unlink()
     dead = subprocess.Popen(["true"])
     dead.wait()
     stale = out / "shards" / "1_box_a" / f".x.h5.{host_label()}~{dead.pid}~0123456789ab.tmp"
@@ -286,9 +264,7 @@ def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: 
 def test_full_disk_of_the_client_is_one_error(
     meshes: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
+    full = Mock(side_effect=OSError(28, "No space left on device"))
     monkeypatch.setattr("drakegrasp.dataset.manifest.write_atomic", full)
     with pytest.raises(DiskFullError, match=r"disk or the quota is full .* continues from here"):
         build(meshes, tmp_path / "out", config)
@@ -298,9 +274,6 @@ def test_full_disk_of_the_client_is_one_error(
 def test_blank_image_never_becomes_data(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def blank(*_: object) -> rendering.RenderedView:
-        raise BlankImageError(rendering.BLANK)
-
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     with h5py.File(undisturbed / "trials.hdf5") as file:
         row = int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
@@ -309,7 +282,7 @@ def test_blank_image_never_becomes_data(
     shard = out / "shards" / name / f"{start:07d}-{start + 1:07d}.h5"
     shard.unlink()
     with monkeypatch.context() as patch:
-        patch.setattr(attempts, "render", blank)
+        patch.setattr(attempts, "render", Mock(side_effect=BlankImageError(rendering.BLANK)))
         with pytest.raises(BlankImageError, match="must not be blank"):
             build(meshes, out, config)
     assert not shard.exists()

@@ -28,16 +28,11 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> BuildReport:
     (folder / "meshes").mkdir()
     pole = trimesh.creation.box([0.03, 0.03, 0.14]).subdivide().subdivide()
     pole.export(folder / "meshes" / "11_box_slim.obj")
+    sampler = write_above(folder, 0.06, x=0.013)
+    rules = ["candidates.max=1", f"candidates.method={sampler}", "candidates.standoffs=[0.06]"]
     config = load_config(
         hand=str(write_with_optional_fingers(folder, 0, 1)),
-        overrides=[
-            *(
-                *SMALL,
-                "candidates.max=1",
-                f"candidates.method={write_above(folder, 0.06, x=0.013)}",
-            ),
-            *("candidates.standoffs=[0.06]", "camera.size=32"),
-        ],
+        overrides=[*SMALL, *rules, "camera.size=32"],
     )
     return build(folder / "meshes", folder / "out", config)
 
@@ -46,7 +41,7 @@ def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(
     report: BuildReport,
 ) -> None:
     assert report.assembly is not None and report.assembly.removed[Removal.MISSING_FINGER] == 1
-    assert [str(v) for v in check_dataset(report.out)] == []
+    assert check_dataset(report.out) == []
     with h5py.File(report.out / "trials.hdf5") as file:
         removal = file["successes/removal"][:]
         row = int(file["successes/trial_id"][:][removal == Removal.MISSING_FINGER][0])

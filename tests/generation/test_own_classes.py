@@ -7,6 +7,7 @@ import pickle
 import re
 import shlex
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,69 +41,21 @@ from drakegrasp.simulation.candidates import Candidates, Drawing, palm_attempts
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "own-sampler.md"
 
-#: What samplers may be otherwise, and what is said of them.
-WRONG_SAMPLERS = {
-    "syntax": ("class Mine(:", r"mine\.py: must be imported, got SyntaxError \(.*line 1\)"),
-    "no class": ("Other = 3", r"mine\.py: must have a class Mine, got none"),
-    "constructor": (
-        "class Mine:\n  def __init__(self, model): pass\n  def poses(self): yield",
-        r"mine\.py:Mine: must take \(model, X_TO, stream, config\), got other arguments",
-    ),
-    "no method": (
-        "class Mine:\n  def __init__(self, model, X_TO, stream, config): pass",
-        r"mine\.py:Mine: must have a method poses\(self\), got none like it",
-    ),
-}
-#: What a sampler may yield otherwise.
-WRONG_POSES = {
-    "shape": ("yield np.eye(3)", r"Mine: pose 0 must be a pose, 4 x 4 .* of shape \(3, 3\)"),
-    "NaN": ("yield np.eye(4); yield np.nan * np.eye(4)", r"pose 1 must be finite"),
-    "words": ("yield 'up'", r"pose 0 must be a pose, 4 x 4 numbers"),
-    "no poses": ("return None", r"Mine: must run, got TypeError"),
-    "error": (
-        "yield 1 / 0",
-        r"mine\.py:Mine: must run, got ZeroDivisionError in line 4 \(",
-    ),
-}
-#: What a sampler may yield beside a pose otherwise, for which hand, and what is said of it.
-WRONG_SHAPES = {
-    "no pair": (
-        "0.3",
-        "barrett",
-        r"pose 1 must have a shape \(preshape, spread in rad\), got float",
-    ),
-    "degrees": ("(None, 22.5)", "barrett", r"pose 1: spread must be 0 to 3\.14 rad .*, got 22\.5$"),
-    "NaN": ("(None, np.nan)", "barrett", r"spread must be 0 to 3\.14 rad .* barrett, got nan$"),
-    "no preshapes": ("('pinch', 0)", "barrett", r"preshape must be None .* barrett, got 'pinch'$"),
-    "other preshape": (
-        "('pinch', 0)",
-        "allegro_four",
-        r"preshape must be one of tripod, envelope, or its index, for the hand .*, got 'pinch'$",
-    ),
-    "no preshape": ("(None, 0)", "allegro_four", r"preshape must be one of .*, got None$"),
-}
-#: What a filter may return otherwise.
-WRONG_FILTERS = {
-    "numbers": (
-        "np.ones(len(successes.slip))",
-        r"keep must return \(3,\) of bool, got \(3,\) of fl",
-    ),
-    "shape": (
-        "np.array(True)",
-        r"Mine: keep must return \(3,\) of bool, got \(\) of bool",
-    ),
-    "error": ("successes.magic", r"Mine: must run, got AttributeError in line 4 \(.*magic"),
-}
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own(folder: Path) -> Path:
     """The current folder with both files of the page."""
-    monkeypatch.chdir(tmp_path)
     texts = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
     for name, text in zip(("my_sampler.py", "my_filter.py"), texts, strict=True):
-        (tmp_path / name).write_text(text)
-    return tmp_path
+        (folder / name).write_text(text)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -153,29 +106,6 @@ def test_a_changed_file_is_another_dataset_wherever_it_lies(own: Path) -> None:
     assert changed.simulation_hash() != config.simulation_hash()
 
 
-@pytest.mark.parametrize("name", WRONG_SAMPLERS)
-def test_a_class_that_cannot_be_used_is_refused_in_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    text, message = WRONG_SAMPLERS[name]
-    Path("mine.py").write_text(text)
-    with pytest.raises(ConfigError, match=message) as caught:
-        build_config(load_config(overrides=["candidates.method=mine.py:Mine"]))
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", WRONG_POSES)
-def test_what_is_no_pose_is_refused_in_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, box: ObjectModel
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    text, message = WRONG_POSES[name]
-    with pytest.raises(ConfigError, match=message) as caught:
-        draw(box, sampler(text))
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("hand", "shape", "stored"),
     [
@@ -187,15 +117,9 @@ def test_what_is_no_pose_is_refused_in_one_line(
     ],
 )
 def test_a_palm_with_a_shape_of_the_hand_is_tried_once(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    box: ObjectModel,
-    hand: str,
-    shape: str,
-    stored: tuple[int, float],
+    box: ObjectModel, hand: str, shape: str, stored: tuple[int, float]
 ) -> None:
     """Beside palms without one, which are tried at each stand-off."""
-    monkeypatch.chdir(tmp_path)
     text = f"X = np.diag([1.0, -1, -1, 1]); X[2, 3] = 0.2; yield X, {shape}; yield X"
     config = sampler(text, hand)
     drawn = draw(box, config)
@@ -209,24 +133,88 @@ def test_a_palm_with_a_shape_of_the_hand_is_tried_once(
     assert [a.standoff for a in others] == list(config.candidates.standoffs)
 
 
-@pytest.mark.parametrize("name", WRONG_SHAPES)
-def test_what_is_no_shape_of_the_hand_is_refused_in_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, box: ObjectModel
+# What is refused
+
+
+def use(text: str, box: ObjectModel) -> None:
+    """Use a file as that of a sampler."""
+    Path("mine.py").write_text(text)
+    build_config(load_config(overrides=["candidates.method=mine.py:Mine"]))
+
+
+def poses(body: str, box: ObjectModel) -> None:
+    """Draw the poses of a sampler."""
+    draw(box, sampler(body))
+
+
+def barrett(shape: str, box: ObjectModel) -> None:
+    """Draw a pose with a shape after one with a good shape."""
+    draw(box, sampler(f"yield np.eye(4), (None, 0.0); yield np.eye(4), {shape}"))
+
+
+def allegro(shape: str, box: ObjectModel) -> None:
+    body = f"yield np.eye(4), (0, 0.0); yield np.eye(4), {shape}"
+    draw(box, sampler(body, "allegro_four"))
+
+
+def verdict(value: str, box: ObjectModel) -> None:
+    """Let a filter return a value."""
+    lines = ["import numpy as np", "class Mine:", "  def keep(self, successes):"]
+    Path("mine.py").write_text("\n".join([*lines, f"    return {value}"]))
+    judge(good(3), load_config(overrides=["filters.own=mine.py:Mine"]).filters)
+
+
+MADE = "class Mine:\n  def __init__(self, model"
+
+
+@pytest.mark.parametrize(
+    ("how", "text", "message"),
+    [
+        (use, "class Mine(:", r"mine\.py: must be imported, got SyntaxError \(.*line 1\)"),
+        (use, "Other = 3", r"mine\.py: must have a class Mine, got none"),
+        (
+            use,
+            f"{MADE}): pass\n  def poses(self): yield",
+            r"mine\.py:Mine: must take \(model, X_TO, stream, config\), got other arguments",
+        ),
+        (
+            use,
+            f"{MADE}, X_TO, stream, config): pass",
+            r"mine\.py:Mine: must have a method poses\(self\), got none like it",
+        ),
+        (poses, "yield np.eye(3)", r"Mine: pose 0 must be a pose, 4 x 4 .* of shape \(3, 3\)"),
+        (poses, "yield np.eye(4); yield np.nan * np.eye(4)", r"pose 1 must be finite"),
+        (poses, "yield 'up'", r"pose 0 must be a pose, 4 x 4 numbers"),
+        (poses, "return None", r"Mine: must run, got TypeError"),
+        (poses, "yield 1 / 0", r"mine\.py:Mine: must run, got ZeroDivisionError in line 4 \("),
+        (barrett, "0.3", r"pose 1 must have a shape \(preshape, spread in rad\), got float"),
+        (barrett, "(None, 22.5)", r"pose 1: spread must be 0 to 3\.14 rad .*, got 22\.5$"),
+        (barrett, "(None, np.nan)", r"spread must be 0 to 3\.14 rad .* barrett, got nan$"),
+        (barrett, "('pinch', 0)", r"preshape must be None .* barrett, got 'pinch'$"),
+        (
+            allegro,
+            "('pinch', 0)",
+            r"must be one of tripod, envelope, or its index, for the hand .*, got 'pinch'$",
+        ),
+        (allegro, "(None, 0)", r"preshape must be one of .*, got None$"),
+        (verdict, "np.ones(len(successes.slip))", r"must return \(3,\) of bool, got \(3,\) of fl"),
+        (verdict, "np.array(True)", r"Mine: keep must return \(3,\) of bool, got \(\) of bool"),
+        (verdict, "successes.magic", r"Mine: must run, got AttributeError in line 4 \(.*magic"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(
+    how: Callable[[str, ObjectModel], None], text: str, message: str, box: ObjectModel
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    shape, hand, message = WRONG_SHAPES[name]
-    first = "(None, 0.0)" if hand != "allegro_four" else "(0, 0.0)"
     with pytest.raises(ConfigError, match=message) as caught:
-        draw(box, sampler(f"yield np.eye(4), {first}; yield np.eye(4), {shape}", hand))
+        how(text, box)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.nightly
 def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     """Whatever runs them takes the same option, and so do the lines that other commands print."""
-    monkeypatch.chdir(tmp_path)
     rule = "class {}:\n  def keep(self, successes): return successes.trial_id.argsort() % 2 == 0\n"
     for name in ("Even", "Half"):
         Path(f"{name.lower()}.py").write_text(rule.format(name))
@@ -259,20 +247,6 @@ def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(
     assert len(kept.config.filters.own) == 2
 
 
-@pytest.mark.parametrize("name", WRONG_FILTERS)
-def test_what_is_no_verdict_is_refused_in_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    value, message = WRONG_FILTERS[name]
-    lines = ["import numpy as np", "class Mine:", "  def keep(self, successes):"]
-    Path("mine.py").write_text("\n".join([*lines, f"    return {value}"]))
-    config = load_config(overrides=["filters.own=mine.py:Mine"])
-    with pytest.raises(ConfigError, match=message) as caught:
-        judge(good(3), config.filters)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.sim
 @pytest.mark.slow
 def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
@@ -291,7 +265,7 @@ def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
     report = build(sources, out, config)
     removed = report.assembly.removed
     assert removed[Removal.OWN] == removed[Removal.KEPT] > 0
-    assert [str(v) for v in check_dataset(out)] == []
+    assert check_dataset(out) == []
     with h5py.File(out / "trials.hdf5") as file:
         assert set(file["trials/source"][:]) == {Source.OWN}
 
@@ -299,7 +273,7 @@ def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
     for name in ("my_sampler.py", "my_filter.py", "half.py"):
         (own / name).rename(own / f"{name}.txt")
     assert not read_manifest(out).config.code
-    assert [str(v) for v in check_dataset(out)] == []
+    assert check_dataset(out) == []
     assert replay_trial(out, 0).same
     with pytest.raises(ConfigError, match=r"my_filter\.py:Wide@.* must be given again"):
         assemble(out, overrides=["filters.max_slip=null"])

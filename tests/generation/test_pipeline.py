@@ -26,14 +26,12 @@ from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
-from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.generation.prepare import prepare_one
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.generation.work_unit import run_unit
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.executor import Executor, run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -45,7 +43,6 @@ def _nothing_runs(function: Callable, items: Iterable) -> Iterator:
     return (function(item) for item in pending)
 
 
-Again = Callable[..., BuildReport]
 #: One attempt at an object, far from it: there is nothing to lift.
 FAR = ("candidates.max=1", "candidates.method=normals", "candidates.standoffs=[0.2]")
 
@@ -60,22 +57,6 @@ def out(small_dataset: Path, tmp_path: Path) -> Path:
 def meshes(small_meshes: Path, tmp_path: Path) -> Path:
     """A copy of its meshes."""
     return Path(shutil.copytree(small_meshes, tmp_path / "meshes"))
-
-
-@pytest.fixture
-def again(small_meshes: Path, small_config: Config) -> Again:
-    """Builds in a directory, of the meshes and by the rules of the small dataset."""
-
-    def build_again(
-        out: Path,
-        execute: Executor = run_here,
-        *,
-        meshes: Path = small_meshes,
-        config: Config = small_config,
-    ) -> BuildReport:
-        return build(meshes, out, config, execute)
-
-    return build_again
 
 
 def test_every_attempt_has_a_row_and_every_success_a_look(small_dataset: Path) -> None:
@@ -94,7 +75,7 @@ def test_every_attempt_has_a_row_and_every_success_a_look(small_dataset: Path) -
 
 
 def test_dataset_keeps_every_invariant(small_dataset: Path) -> None:
-    assert [str(v) for v in check_dataset(small_dataset)] == []
+    assert check_dataset(small_dataset) == []
 
 
 @pytest.mark.cluster
@@ -113,30 +94,32 @@ def test_number_of_workers_changes_nothing(
     assert_same_dataset(small_dataset, out)
 
 
-def test_second_build_simulates_nothing(out: Path, again: Again) -> None:
+def test_second_build_simulates_nothing(
+    small_meshes: Path, out: Path, small_config: Config
+) -> None:
     before = {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")}
-    report = again(out, _nothing_runs)
+    report = build(small_meshes, out, small_config, _nothing_runs)
     assert (report.simulated, report.reused) == (0, 12)
     assert {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")} == before
 
 
 def test_changed_mesh_is_done_again_and_the_others_are_not(
-    meshes: Path, out: Path, again: Again
+    meshes: Path, out: Path, small_config: Config
 ) -> None:
     # No hand closes around it, so that there is little to simulate.
     trimesh.creation.box([0.15, 0.15, 0.12]).export(meshes / "10_box_tall.obj")
-    report = again(out, meshes=meshes)
+    report = build(meshes, out, small_config)
     assert (report.simulated, report.reused) == (4, 8)
-    assert [str(v) for v in check_dataset(out)] == []
+    assert check_dataset(out) == []
 
 
-def test_object_keeps_to_what_is_said_of_it(meshes: Path, out: Path, again: Again) -> None:
+def test_object_keeps_to_what_is_said_of_it(meshes: Path, out: Path, small_config: Config) -> None:
     """A changed entry of objects.yaml prepares and simulates that object again, and no other."""
     said = "objects: {11_box_slim: {density: 600, friction: 0.9}}\n"
     (meshes / "objects.yaml").write_text(said)
-    report = again(out, meshes=meshes)
+    report = build(meshes, out, small_config)
     assert (report.simulated, report.reused) == (4, 8)
-    assert [str(v) for v in check_dataset(out)] == []
+    assert check_dataset(out) == []
 
     # The manifest and /objects have it, and the lift is simulated with it.
     entry = read_manifest(out).objects[1]
@@ -149,50 +132,52 @@ def test_object_keeps_to_what_is_said_of_it(meshes: Path, out: Path, again: Agai
             (file["trials/object"][()] == 1) & np.isfinite(file["trials/slip"][()])
         )
     assert replay_trial(out, int(lifted[0])).same
-    second = again(out, _nothing_runs, meshes=meshes)
+    second = build(meshes, out, small_config, _nothing_runs)
     assert second.reused == 12
 
 
 def test_changed_class_is_in_the_files_without_a_simulation(
-    meshes: Path, out: Path, again: Again
+    meshes: Path, out: Path, small_config: Config
 ) -> None:
     (meshes / "objects.yaml").write_text("objects: {11_box_slim: {class: carton}}\n")
-    report = again(out, meshes=meshes)
+    report = build(meshes, out, small_config)
     assert (report.simulated, report.reused, report.assembled) == (0, 12, True)
-    assert [str(v) for v in check_dataset(out)] == []
+    assert check_dataset(out) == []
     with h5py.File(out / "trials.hdf5") as file:
         assert file["objects/class_name"].asstr()[1] == "carton"
-    second = again(out, _nothing_runs, meshes=meshes)
+    second = build(meshes, out, small_config, _nothing_runs)
     assert not second.assembled
 
     # A group does not even need the object to be prepared.
     said = "objects: {11_box_slim: {class: carton, group: box}}\n"
     (meshes / "objects.yaml").write_text(said)
-    second = again(out, _nothing_runs, meshes=meshes)
+    second = build(meshes, out, small_config, _nothing_runs)
     assert second.assembled and read_manifest(out).objects[1].group == "box"
 
 
-def test_build_keeps_what_an_inspection_rejected(meshes: Path, out: Path, again: Again) -> None:
+def test_build_keeps_what_an_inspection_rejected(
+    meshes: Path, out: Path, small_config: Config
+) -> None:
     """But not of a mesh that has changed since: its grasps are other ones."""
     assemble(out, rejected=[GraspDataset(out / "grasping_oto.hdf5", split="test")[0].trial_id])
     (out / "trials.hdf5").unlink()
-    report = again(out, _nothing_runs, meshes=meshes)
+    report = build(meshes, out, small_config, _nothing_runs)
     assert report.assembly.removed[Removal.REJECTED] == 1
 
     # No mesh is simulated again here: only its entry counts.
     manifest = read_manifest(out)
     changed = [replace(entry, mesh_sha256="0" * 64) for entry in manifest.objects]
     write_manifest(replace(manifest, objects=tuple(changed)), out)
-    again(out, meshes=meshes)
+    build(meshes, out, small_config)
     assert read_manifest(out).rejected == ()
 
 
 def test_other_configuration_is_refused_and_nothing_changes(
-    out: Path, small_config: Config, again: Again
+    small_meshes: Path, out: Path, small_config: Config
 ) -> None:
     before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file())
     with pytest.raises(DataError, match=r"differs in seed \(0 there, 1 here\); choose another"):
-        again(out, _nothing_runs, config=override_config(small_config, ["seed=1"]))
+        build(small_meshes, out, override_config(small_config, ["seed=1"]), _nothing_runs)
     assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file()) == before
 
 
@@ -224,7 +209,7 @@ def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:
     build(meshes, out, config)
     assert count_funnel(out).names == ("1_чашка большая_a", "2_crème brûlée_b")
     assert count_funnel(out).classes == ("чашка большая", "crème brûlée")
-    assert [str(v) for v in check_dataset(out)] == []
+    assert check_dataset(out) == []
 
 
 def test_somebody_elses_directory_is_refused(tmp_path: Path, small_meshes: Path) -> None:
@@ -286,4 +271,4 @@ def test_repeats_come_with_the_samples_and_change_none(
     assert not tried[~lifted].any()
     assert (repeated <= tried).all()
     assert (repeated[kept] == 2).any()
-    assert [str(v) for v in check_dataset(tmp_path / "out")] == []
+    assert check_dataset(tmp_path / "out") == []

@@ -22,12 +22,8 @@ def task(tmp_path: Path) -> PrepareTask:
     box = trimesh.creation.box([0.05, 0.06, 0.07]).subdivide().subdivide()
     box.export(tmp_path / "meshes" / "1_box.stl")
     (source,) = find_meshes(tmp_path / "meshes")
-    return PrepareTask(
-        source=source,
-        out=tmp_path / "out",
-        config=load_config(overrides=["candidates.max=5"]),
-        restartable=False,
-    )
+    config = load_config(overrides=["candidates.max=5"])
+    return PrepareTask(source=source, out=tmp_path / "out", config=config, restartable=False)
 
 
 def test_worker_reads_the_mesh_file_once_and_parses_that_of_a_prepared_object_not_at_all(

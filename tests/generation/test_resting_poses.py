@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -16,7 +17,6 @@ from helpers.meshes import write_fixed
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -62,13 +62,6 @@ def trials(out: Path) -> dict[str, np.ndarray]:
         return {name: values[:] for name, values in file["trials"].items()}
 
 
-def samples(out: Path) -> np.ndarray:
-    """Return the rows of the samples."""
-    with h5py.File(out / "trials.hdf5") as file:
-        removal, ids = file["successes/removal"][:], file["successes/trial_id"][:]
-    return np.asarray(ids[removal == Removal.KEPT])
-
-
 def test_samplers_and_resting_poses_take_turns(dataset: Path) -> None:
     columns = trials(dataset)
     first = columns["standoff_index"] == 0
@@ -101,24 +94,14 @@ def test_lifts_are_tried_elsewhere_as_they_lay(
     dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mujoco_baseline = pytest.importorskip("mujoco_baseline")
-    stood: list[np.ndarray] = []
-
-    class Peer:
-        """Says where the object stood when a lift was tried."""
-
-        def __init__(self, *_: object) -> None:
-            pass
-
-        def place(self, X_TO: np.ndarray) -> None:
-            self.X_TO = X_TO
-
-        def run(self, _: object) -> object:
-            stood.append(self.X_TO)
-            return mujoco_baseline.PeerTrial(outcome=Outcome.MOVED)
-
-    monkeypatch.setattr(mujoco_baseline, "MujocoBaseline", Peer)
+    peer = Mock()
+    peer.run.return_value = mujoco_baseline.PeerTrial(outcome=Outcome.MOVED)
+    monkeypatch.setattr(mujoco_baseline, "MujocoBaseline", lambda *_: peer)
     lifts = cross_check(dataset, 12)["lifts"]
     columns = trials(dataset)
     ids = [lift["trial_id"] for lift in lifts]
     assert len(np.unique(columns["resting"][ids])) > 1
+    # Each lift is run where it was placed.
+    assert [name for name, *_ in peer.mock_calls] == len(ids) * ["place", "run"]
+    stood = [call.args[0] for call in peer.place.call_args_list]
     np.testing.assert_array_equal(stood, [unpack_pose(columns["X_TO"][i]) for i in ids])

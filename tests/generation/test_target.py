@@ -86,16 +86,6 @@ def test_number_that_was_asked_for_is_the_number(wanted: int) -> None:
     assert found["short"] == 3 or abs(found["short"] - found["poor"]) <= 1
 
 
-def test_samples_are_spread_evenly() -> None:
-    found = samples(run(make_target(samples=40)))
-    assert found == {"rich": 19, "poor": 18, "barren": 0, "short": 3}
-
-
-def test_result_does_not_depend_on_the_number_of_workers() -> None:
-    alone = run(make_target(samples=25))
-    assert [run(make_target(samples=25), workers) for workers in (2, 3, 8)] == 3 * [alone]
-
-
 @pytest.mark.parametrize("ends", [{"samples_per_object": 4}, {"samples": 40}])
 @pytest.mark.parametrize("workers", [3, 30])
 def test_result_does_not_depend_on_units_that_were_run_in_vain(
