@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 from distributed import Client, KilledWorker, LocalCluster
-from server.processes import dask_scheduler
+from server.processes import dask_scheduler, small_cluster
 
 from drakegrasp.cluster import executor as tasks
 from drakegrasp.cluster.connect import connect
@@ -19,12 +19,6 @@ from drakegrasp.errors import BlankImageError, MachineError
 from drakegrasp.vision import rendering
 
 pytestmark = pytest.mark.cluster
-
-
-def small_cluster(workers: int) -> LocalCluster:
-    """Return a cluster in this process."""
-    there = {"threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
-    return LocalCluster(n_workers=workers, **there)
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import pytest
 import trimesh
-from distributed import Client, LocalCluster, Worker
+from distributed import Client, Worker
 from helpers.builds import FAST, build
 from helpers.file_tasks import Join, join
 from helpers.tiers import in_second_tier
+from server.processes import small_cluster
 
 from drakegrasp import build_dataset
 from drakegrasp.cluster import wire
@@ -29,39 +32,24 @@ from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.cluster.wire import by_wire
 from drakegrasp.cluster.worker_checks import checked_workers
-from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
 from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool
-from drakegrasp.simulation.attempts import Attempts
 
 pytestmark = pytest.mark.cluster
 
 #: One attempt, which gives a sample.
-SAMPLE = [
-    *FAST,
-    "candidates.method=closing",
-    "candidates.max=1",
-    "physics.friction_hand=1.5",
-]
+SAMPLE = [*FAST, "candidates.method=closing", "candidates.max=1", "physics.friction_hand=1.5"]
 #: Every kind of step of a unit: also repeats.
-EVERY_STEP = [
-    *SAMPLE,
-    "robustness.repeats=1",
-]
+EVERY_STEP = [*SAMPLE, "robustness.repeats=1"]
 
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
-    with (
-        LocalCluster(
-            n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    with small_cluster(1) as cluster, Client(cluster) as client:
         yield client
 
 
@@ -99,13 +87,19 @@ def names_in(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.fixture
+def fetched(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
+    """Returns the names of the files that workers got from the scheduler."""
+    fetch = Mock(wraps=wire._fetched)
+    monkeypatch.setattr(wire, "_fetched", fetch)
+    return lambda: [call.args[0] for call in fetch.call_args_list]
+
+
 def test_files_go_once_and_results_come_back(
-    client: Client, out: Path, monkeypatch: pytest.MonkeyPatch
+    client: Client, out: Path, fetched: Callable[[], list[str]]
 ) -> None:
     put(out, 12)
     (out / "old").write_text("")
-    fetched, fetch = list[str](), wire._fetched
-    monkeypatch.setattr(wire, "_fetched", lambda *args: fetched.append(args[0]) or fetch(*args))
     tasks = [Join(out=out, number=number) for number in range(12)]
     with by_wire(DaskExecutor(client), client, out) as execute:
         assert sorted(execute(join, tasks)) == list(range(12))
@@ -113,36 +107,33 @@ def test_files_go_once_and_results_come_back(
         assert len(list(copies.glob("in/*"))) == 1 + wire.KEPT_TASKS
         assert not list(copies.glob("out/*"))
         assert not (out / "old").exists()
-        assert [(out / f"out/{i}").read_text() for i in range(12)] == [
-            f"common {i}" for i in range(12)
-        ]
-        assert len(fetched) == len(set(fetched)) == 13
+        assert all((out / f"out/{i}").read_text() == f"common {i}" for i in range(12))
+        assert len(fetched()) == len(set(fetched())) == 13
 
         # What the scheduler was told to forget comes again, under another name.
         assert list(execute(join, tasks[:1])) == [0]
-        assert len(fetched) == len(set(fetched)) == 14
+        assert len(fetched()) == len(set(fetched())) == 14
     assert not copies.exists()
-    assert_nothing_kept(client)
+    wait_for_variables(client, 0)
 
 
 def test_builds_at_the_same_time_keep_their_copies_and_share_a_process(
-    client: Client, out: Path, monkeypatch: pytest.MonkeyPatch
+    client: Client,
+    out: Path,
+    fetched: Callable[[], list[str]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     put(out, 4)
-    fetched, fetch = list[str](), wire._fetched
-    monkeypatch.setattr(wire, "_fetched", lambda *args: fetched.append(args[0]) or fetch(*args))
-    started, start = list[Path](), wire.ProcessApart
-    monkeypatch.setattr(
-        wire, "ProcessApart", lambda folder: started.append(folder) or start(folder)
-    )
+    start = Mock(wraps=ProcessApart)
+    monkeypatch.setattr(wire, "ProcessApart", start)
     tasks = [Join(out=out, number=number) for number in range(4)]
     with by_wire(DaskExecutor(client), client, out) as one:
         list(one(join, tasks[:1]))
         with by_wire(DaskExecutor(client), client, out) as other:
             done = zip(one(join, tasks), other(join, tasks), strict=True)
             assert sorted(done) == [(i, i) for i in range(4)]
-        assert len(started) == 1
-        assert len(fetched) == len(set(fetched)) == 2 * 5
+        assert start.call_count == 1
+        assert len(fetched()) == len(set(fetched())) == 2 * 5
         assert list(one(join, tasks)) == list(range(4))
 
 
@@ -154,21 +145,20 @@ def test_scheduler_forgets_the_files_of_a_client_that_is_killed(client: Client, 
             wire._Wire(execute, killed, out, "a")._offer(out / "in/common")
             wire._Wire(execute, client, out, "b")._offer(out / "in/0")
             assert len(client.run_on_scheduler(variables)) == 2
-        end = time.monotonic() + 30.0
-        while len(left := client.run_on_scheduler(variables)) > 1 and time.monotonic() < end:
-            time.sleep(0.01)
-        assert [client.id in name for name in left] == [True]
-        wire.Variable(left[0], client=client).delete()
+        wait_for_variables(client, 1)
+        (left,) = client.run_on_scheduler(variables)
+        assert client.id in left
+        wire.Variable(left, client=client).delete()
 
 
 def local_directory(dask_worker: Worker) -> str:
     return str(dask_worker.local_directory)
 
 
-def assert_nothing_kept(client: Client) -> None:
+def wait_for_variables(client: Client, count: int) -> None:
     """The scheduler forgets what it was told to, a moment later."""
     end = time.monotonic() + 30.0
-    while client.run_on_scheduler(variables):
+    while len(client.run_on_scheduler(variables)) != count:
         assert time.monotonic() < end
         time.sleep(0.01)
 
@@ -195,7 +185,7 @@ def test_error_of_a_task_is_raised_here_and_nothing_is_kept(client: Client, out:
     with by_wire(DaskExecutor(client), client, out) as execute:
         with pytest.raises(ValueError, match="-1 < 0"):
             list(execute(join, [Join(out=out, number=-1), Join(out=out, number=0)]))
-        assert_nothing_kept(client)
+        wait_for_variables(client, 0)
         # Other items stay here.
         assert list(execute(abs, [-1])) == [1]
 
@@ -208,12 +198,9 @@ class Slow:
 
 
 def test_process_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
-    process, began = ProcessApart(tmp_path), time.monotonic()
-    try:
-        with pytest.raises(wire.ApartError):
-            process.call(pickle.dumps(Slow()), tmp_path, memory=1.0)
-    finally:
-        process.close()
+    began = time.monotonic()
+    with closing(ProcessApart(tmp_path)) as process, pytest.raises(wire.ApartError):
+        process.call(pickle.dumps(Slow()), tmp_path, memory=1.0)
     assert time.monotonic() - began < 30.0
 
 
@@ -223,14 +210,11 @@ def test_process_does_its_calls_though_ctrl_c_reaches_it(
     """The client stops its workers itself."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(os.path.abspath, sys.path)))
     put(tmp_path, 1)
-    process = ProcessApart(tmp_path)
-    try:
+    call = pickle.dumps((join, Join(out=tmp_path, number=0)))
+    with closing(ProcessApart(tmp_path)) as process:
         for _ in range(2):
-            call = pickle.dumps((join, Join(out=tmp_path, number=0)))
             assert pickle.loads(process.call(call, tmp_path, memory=1e12)) == 0
             process._process.send_signal(signal.SIGINT)
-    finally:
-        process.close()
 
 
 @pytest.mark.sim
@@ -240,18 +224,11 @@ def test_every_kind_of_task_gives_the_same_bytes(
 ) -> None:
     config, here = load_config(overrides=settings), tmp_path / "here"
     build(meshes, here, config)
-    build_by_wire(client, meshes, out, config)
+    with by_wire(DaskExecutor(client), client, out) as execute:
+        build(meshes, out, config, execute, pool=WorkerPool())
     assert_same_files(here, out)
     with h5py.File(out / "trials.hdf5") as file:
         assert file["trials/outcome"][0] == Outcome.SUCCESS
-
-
-def build_by_wire(
-    client: Client, meshes: Path, out: Path, config: Config, postures: Attempts | None = None
-) -> BuildReport:
-    with by_wire(DaskExecutor(client), client, out) as execute:
-        rest = {"pool": WorkerPool(), "postures": postures, "show": False}
-        return build(meshes, out, config, execute, **rest)
 
 
 @pytest.mark.nightly

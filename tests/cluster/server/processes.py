@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from distributed import LocalCluster
+
 #: How long a server may take to start or to stop [s].
 PATIENCE = 60.0
 
@@ -53,6 +55,12 @@ def wait_until(ready: Callable[[], bool], what: str, log: Path) -> None:
             tail = log.read_text(errors="replace")[-2000:] if log.exists() else ""
             raise TimeoutError(f"{what} must be ready within {PATIENCE:g} s; its log ends: {tail}")
         time.sleep(0.2)
+
+
+def small_cluster(workers: int) -> LocalCluster:
+    """Return a Dask cluster in this process."""
+    there = {"threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
+    return LocalCluster(n_workers=workers, **there)
 
 
 @contextmanager
