@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,14 @@ from drakegrasp.errors import (
     one_line,
 )
 from drakegrasp.exchange import columns
-from drakegrasp.exchange.columns import ARRAYS, CONTACTS, HDF5_SUFFIXES, array_names, read_contacts
+from drakegrasp.exchange.columns import (
+    ARRAYS,
+    CONTACTS,
+    HDF5_SUFFIXES,
+    array_names,
+    is_graspgen,
+    read_contacts,
+)
 from drakegrasp.frames import Array, as_numbers, unpack_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.protocols.postures import is_grasp_file
@@ -397,11 +404,6 @@ def holds_postures(path: Path) -> bool:
     except Exception as error:  # parsers raise all kinds of exceptions on foreign bytes
         raise GraspError(f"{path}: {one_line(error)}") from None
     return suffix in suffixes() and suffix not in CONTACTS
-
-
-def is_graspgen(names: Iterable[str]) -> bool:
-    """Return whether an HDF5 file with these names at its root holds predictions of GraspGen."""
-    return {"misc", "objects"} <= set(names)
 
 
 def has_rows(path: Path) -> bool:

@@ -1,12 +1,19 @@
-"""Files of arrays, as other programs write them, and the contacts that some of them hold.
+"""Files of arrays, as other programs write them, and the contacts or palm poses of some of them.
 
-Input: a NumPy or HDF5 file. Output: its arrays as they are stored, or
-the grasps as k points and k outward normals each, with dataset rows and confidence; or an error in
-one line. The meaning of arrays of postures is a matter of `attempts`.
+Input: a NumPy or HDF5 file. Output: its arrays as they are stored; or the grasps as k points and k
+outward normals each, with dataset rows and confidence; or the predictions of GraspGen (github
+NVlabs/GraspGen); or an error in one line. The meaning of arrays of postures is a matter of
+`attempts`.
+
+GraspGen's predictions are the HDF5 file that its `scripts/inference_graspgen.py` writes, with palm
+poses without joints for many objects, and their confidence. They are poses of its gripper frame
+(`graspgen` in a hand file) in the axes of the mesh file, in metres. Its demo writes isaac_grasp,
+which `exchange.isaac_grasp` reads.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +24,7 @@ from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line, one_line
 from drakegrasp.foreign_files import read_npz, validate_regular
 from drakegrasp.frames import Array, as_numbers
+from drakegrasp.hand.description import Hand
 
 #: Suffixes of HDF5 files, of all files of several arrays, and of files that can hold contacts.
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -172,3 +180,71 @@ def _grasps(array: Array, where: str, axes: int) -> Array:
             f"got an array of shape {array.shape}{_POSES if array.shape[-2:] == (4, 4) else ''}"
         )
     return np.atleast_2d(array)
+
+
+# Predictions of GraspGen
+
+
+def is_graspgen(names: Iterable[str]) -> bool:
+    """Return whether an HDF5 file with these names at its root holds predictions of GraspGen."""
+    return {"misc", "objects"} <= set(names)
+
+
+def read_graspgen(path: Path, hand: Hand) -> dict[str, Any] | None:
+    """Return the predictions of GraspGen in a file as arguments of `make_attempts`.
+
+    Returns:
+        The arguments; None if the file does not hold such predictions.
+
+    Raises:
+        GraspError: If the file holds such predictions but is damaged.
+    """
+    with open_hdf5(path) as file:
+        if not is_graspgen(file):
+            return None
+        groups = list[h5py.Group]()
+        file["objects"].visititems(
+            lambda _, item: groups.append(item) if "pred_grasps" in _names(item) else None
+        )
+        validate_size(sum(group["pred_grasps"].nbytes for group in groups))
+
+        # What the groups of the objects and the file as a whole state.
+        try:
+            parts = [_predicted(group) for group in groups]
+            gripper = file.get("misc/gripper_name")
+            gripper = None if gripper is None else gripper.asstr()[()]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise GraspError(
+                f"{path}: objects must have asset_path, asset_scale, pred_grasps and confidence, "
+                f"got others ({one_line(error)})"
+            ) from None
+    if not parts:
+        raise GraspError(f"{path}: objects must have pred_grasps, got none")
+    names, poses, scales, confidences = zip(*parts, strict=True)
+    confidence = np.concatenate(confidences)
+    return {
+        "gripper": gripper,
+        "objects": [name for each in names for name in each],
+        "X_FG": np.concatenate(poses),
+        "link": "graspgen",
+        "frame": "mesh",
+        "scale": np.concatenate(scales),
+        "confidence": confidence,
+        "said": [f"grasp {i}, confidence {stated:g}" for i, stated in enumerate(confidence)],
+        "of_objects": True,
+    }
+
+
+def _names(item: object) -> list[str]:
+    return list(item) if isinstance(item, h5py.Group) else []
+
+
+def _predicted(group: h5py.Group) -> tuple[list[str], Array, Array, Array]:
+    """Return object name, pose (4, 4), scale and confidence of each grasp of one object."""
+    X_MA = as_numbers(group["pred_grasps"][()], "poses must be numbers")
+    if X_MA.ndim != 3 or X_MA.shape[1:] != (4, 4):
+        raise ValueError(f"poses must be of shape (n, 4, 4), got {X_MA.shape}")
+    name = Path(group["asset_path"].asstr()[()]).stem
+    confidence = as_numbers(group["confidence"][()], "confidence must be numbers")
+    scale = np.full(len(X_MA), float(group["asset_scale"][()]))
+    return [name] * len(X_MA), X_MA, scale, confidence.ravel()

@@ -20,7 +20,7 @@ from drakegrasp.errors import GraspError, one_line
 from drakegrasp.exchange.dexgraspbench import pose_vector
 from drakegrasp.exchange.export import ClosedGrasp, samples_by_object
 from drakegrasp.foreign_files import read_text
-from drakegrasp.frames import invert_pose
+from drakegrasp.frames import Array, invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
@@ -34,6 +34,8 @@ from drakegrasp.yaml_text import parse_yaml
 CREATED_WITH = "drakegrasp"
 #: Keys of the joint positions of the grasp and of the pregrasp.
 _STAGES = ("cspace_position", "pregrasp_cspace_position")
+#: A pose that is not stated.
+_NOWHERE = {"position": [np.nan] * 3, "orientation": {"w": np.nan, "xyz": [np.nan] * 3}}
 #: Description of the format in `drakegrasp export --help`.
 HELP = "a YAML file per object: poses of the palm link, joints by name"
 
@@ -65,7 +67,6 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
     """Return the entry of a sample in the file."""
     order = joint_order(hand)
     X_OB = multiply(multiply(invert_pose(grasp.X_TO), grasp.X_TG), invert_pose(hand.X_BG))
-    x, y, z, w, *xyz = pose_vector(X_OB).tolist()
     closed = dict(zip(order, grasp.q.tolist(), strict=True))
 
     # Before the grasp, the fingers that it uses are open; the other joints do not move.
@@ -75,21 +76,22 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
     opened = joint_positions(hand, grasp.spread, [0.0] * hand.num_fingers)
     entry: dict[str, Any] = {
         "confidence": 1.0,
-        "position": [x, y, z],
-        "orientation": {"w": w, "xyz": xyz},
+        **_pose_entry(X_OB),
         "cspace_position": closed,
         "pregrasp_cspace_position": {n: opened[n] if moves[n] else closed[n] for n in order},
         "trial_id": grasp.trial_id,
+        "resting_pose": _pose_entry(grasp.X_TO),
     }
-
-    # The resting pose of the object, and the other conditions of the trial.
-    x, y, z, w, *xyz = pose_vector(grasp.X_TO).tolist()
-    entry["resting_pose"] = {"position": [x, y, z], "orientation": {"w": w, "xyz": xyz}}
     if name := grasp.preshape_name(hand):
         entry["preshape"] = name
     if grasp.conditions is not None:
         entry["conditions"] = dict(zip(CONDITIONS, grasp.conditions.tolist(), strict=True))
     return entry
+
+
+def _pose_entry(X_AB: Array) -> dict[str, Any]:
+    x, y, z, w, *xyz = pose_vector(X_AB).tolist()
+    return {"position": [x, y, z], "orientation": {"w": w, "xyz": xyz}}
 
 
 def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
@@ -102,6 +104,60 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
     Raises:
         GraspError: If the file is not an isaac_grasp file.
     """
+    tree = _read_tree(path)
+    grasps, ours = tree["grasps"], tree.get("created_with") == CREATED_WITH
+    joints = _joint_names(path, grasps)
+    must = "position and orientation"
+    if joints:
+        must = f"position, orientation and cspace_position of the joints {', '.join(joints)}"
+    rows, invalid = [], []
+    for name, grasp in grasps.items():
+        try:
+            rows.append(_row(grasp, joints, ours))
+            invalid.append("")
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            rows.append(_row(_NOWHERE, joints, ours=False))
+            invalid.append(f"{name} must have {must}, got others ({one_line(error)})")
+
+    # The poses, and why a row has none; a grasp need not state the object's.
+    columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+    X_FL, no_palm = quaternion_poses(*np.split(columns["palm"], [3], axis=1))
+    X_TO, no_rest = quaternion_poses(*np.split(columns["rest"], [3], axis=1))
+    lies = np.isfinite(columns["rest"]).any(axis=1)
+    no_rest = [f"resting_pose: {why}" if why else "" for why in np.where(lies, no_rest, "")]
+    trials, stated = columns["trial"], columns["confidence"]
+    return {
+        "objects": [PureWindowsPath(str(tree.get("object_file", path))).stem] * len(grasps),
+        "X_FG": X_FL,
+        "link": hand.palm_link,
+        "frame": "object" if ours else "mesh",
+        "q_grasp": columns["q_grasp"] if joints else None,
+        "q_pregrasp": columns["q_pregrasp"] if joints else None,
+        "joints": joints or None,
+        "alone": columns["alone"],
+        "confidence": None if ours or np.isnan(stated).all() else stated,
+        "said": [
+            f"{name}, confidence {grasp.get('confidence') if isinstance(grasp, dict) else None}"
+            for name, grasp in grasps.items()
+        ],
+        "invalid": [a or b or c for a, b, c in zip(invalid, no_rest, no_palm, strict=True)],
+        "X_TO": X_TO,
+        "conditions": columns["conditions"],
+        "preshape": columns["preshape"].tolist(),
+        "trial": None if np.isnan(trials).any() else trials.astype(np.int64),
+        "of_objects": not ours,
+        "scale": np.full(len(grasps), tree["object_scale"]),
+        "gripper": PureWindowsPath(str(tree.get("gripper_file", ""))).stem,
+        "hand": str(tree["hand"]) if ours and "hand" in tree else None,
+    }
+
+
+def _read_tree(path: Path) -> dict[str, Any]:
+    """Return the content of a file, which has grasps; its scale is a number, NaN if not stated.
+
+    Raises:
+        GraspError: If the file is not an isaac_grasp file.
+    """
     try:
         tree: Any = parse_yaml(read_text(path))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -110,80 +166,55 @@ def read_isaac_grasp(path: Path, hand: Hand) -> dict[str, Any]:
         raise GraspError(f"{path}: format must be isaac_grasp, got another file")
     if str(tree.get("format_version")) not in ("1.0", "1"):
         raise GraspError(f"{path}: format_version must be 1.0, got {tree.get('format_version')!r}")
-    grasps = tree.get("grasps")
-    if not isinstance(grasps, dict) or not grasps:
+    if not isinstance(tree.get("grasps"), dict) or not tree["grasps"]:
         raise GraspError(f"{path}: grasps must be there, got none")
     try:
-        scale = _number(tree.get("object_scale", np.nan))
+        return {**tree, "object_scale": _number(tree.get("object_scale", np.nan))}
     except (TypeError, ValueError) as error:
         raise GraspError(f"{path}: object_scale must be a number, got {one_line(error)}") from None
 
-    # Read from each grasp the joints that the first grasp with joints names. A grasp without
-    # joints is a palm pose without joints.
+
+def _joint_names(path: Path, grasps: dict[str, Any]) -> list[str]:
+    """Return the joints that the first grasp with joints names; none if all are palm poses alone.
+
+    Raises:
+        GraspError: If grasps have joint positions, but none has names of joints.
+    """
     told = [each for each in grasps.values() if isinstance(each, dict)]
     stages = [each[key] for each in told for key in _STAGES if key in each]
     named = next((stage for stage in stages if isinstance(stage, dict) and stage), None)
     if named is None and stages:
         raise GraspError(f"{path}: grasps must have cspace_position, joints by name, got none")
-    joints, invalid = [str(joint) for joint in named or ()], [""] * len(grasps)
-    stated = np.full(len(grasps), np.nan)
-    alone = np.zeros(len(grasps), dtype=bool)
-    ours = tree.get("created_with") == CREATED_WITH
-    numbers = np.full((len(grasps), 7 + 2 * len(joints)), np.nan)
-    known = np.full((len(grasps), 8 + len(CONDITIONS)), np.nan)
-    preshape = [""] * len(grasps)
-    for i, (name, grasp) in enumerate(grasps.items()):
-        try:
-            numbers[i] = _isaac_numbers(grasp, joints)
-            alone[i], stated[i] = _STAGES[0] not in grasp, _number(grasp.get("confidence", np.nan))
-            if ours:
-                known[i], preshape[i] = _of_export(grasp), str(grasp.get("preshape", ""))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            must, names = "position and orientation", ", ".join(joints)
-            if joints:
-                must = f"position, orientation and cspace_position of the joints {names}"
-            invalid[i] = f"{name} must have {must}, got others ({one_line(error)})"
-    X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:7])
-    X_TO, no_rest = quaternion_poses(known[:, :3], known[:, 3:7])
-    lies = np.isfinite(known[:, :7]).any(axis=1)
-    invalid = [
-        one or (f"resting_pose: {other}" if other and is_told else "")
-        for one, other, is_told in zip(invalid, no_rest, lies, strict=True)
-    ]
-    trials = known[:, 7]
-    grasp_q, pregrasp_q = np.split(numbers[:, 7:], 2, axis=1)
+    return [str(joint) for joint in named or ()]
+
+
+def _row(grasp: Any, joints: list[str], ours: bool) -> dict[str, Any]:
+    """Return what a grasp states; NaN, or no preshape, for what it does not.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError: If it is no grasp.
+    """
+    (closed, before), nothing = _STAGES, dict.fromkeys(joints, np.nan)
+    trial = grasp if ours else {}
+    conditions = trial.get("conditions", {})
     return {
-        "objects": [PureWindowsPath(str(tree.get("object_file", path))).stem] * len(grasps),
-        "X_FG": X_FL,
-        "link": hand.palm_link,
-        "frame": "object" if ours else "mesh",
-        **({"q_grasp": grasp_q, "q_pregrasp": pregrasp_q, "joints": joints} if joints else {}),
-        "alone": alone,
-        "confidence": None if ours or np.isnan(stated).all() else stated,
-        "said": [
-            f"{name}, confidence {grasp.get('confidence') if isinstance(grasp, dict) else None}"
-            for name, grasp in grasps.items()
-        ],
-        "invalid": [one or other for one, other in zip(invalid, reasons, strict=True)],
-        "X_TO": X_TO,
-        "conditions": known[:, 8:],
-        "preshape": preshape,
-        "trial": None if np.isnan(trials).any() else trials.astype(np.int64),
-        "of_objects": not ours,
-        "scale": np.full(len(grasps), scale),
-        "gripper": PureWindowsPath(str(tree.get("gripper_file", ""))).stem,
-        "hand": str(tree["hand"]) if ours and "hand" in tree else None,
+        "palm": _place(grasp),
+        "q_grasp": [_number(grasp.get(closed, nothing)[joint]) for joint in joints],
+        "q_pregrasp": [_number((grasp.get(before) or nothing)[joint]) for joint in joints],
+        "alone": closed not in grasp,
+        "confidence": _number(grasp.get("confidence", np.nan)),
+        "rest": _place(trial.get("resting_pose") or _NOWHERE),
+        "trial": _number(trial.get("trial_id", np.nan)),
+        "conditions": [_number(conditions.get(name, np.nan)) for name in CONDITIONS],
+        "preshape": str(trial.get("preshape", "")),
     }
 
 
-def _of_export(grasp: Any) -> list[float]:
-    """Return the object's pose (7,), the trial and the conditions of a grasp; NaN if not stated."""
-    found, lies = [np.nan] * 7, grasp.get("resting_pose")
-    if lies is not None:
-        found = [*lies["position"], lies["orientation"]["w"], *lies["orientation"]["xyz"]]
-    told = grasp.get("conditions", {})
-    found += [grasp.get("trial_id", np.nan), *(told.get(name, np.nan) for name in CONDITIONS)]
-    return [_number(value) for value in found]
+def _place(stated: Any) -> list[float]:
+    """Return a position and a quaternion w, x, y, z (7,)."""
+    (x, y, z), turn = stated["position"], stated["orientation"]
+    i, j, k = turn["xyz"]
+    return [_number(value) for value in (x, y, z, turn["w"], i, j, k)]
 
 
 def _number(value: Any) -> float:
@@ -195,12 +226,3 @@ def _number(value: Any) -> float:
     if isinstance(value, bool):
         raise TypeError(f"{value}")
     return float(value)
-
-
-def _isaac_numbers(grasp: Any, joints: list[str]) -> list[float]:
-    """Return position, quaternion, joints at grasp and pregrasp; NaN for missing numbers."""
-    turn, nothing = grasp["orientation"], dict.fromkeys(joints, np.nan)
-    closed, before = _STAGES
-    q = [grasp.get(closed, nothing), grasp.get(before) or nothing]
-    place = [*grasp["position"], turn["w"], *turn["xyz"]]
-    return [_number(v) for v in (*place, *(stage[joint] for stage in q for joint in joints))]
