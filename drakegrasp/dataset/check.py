@@ -22,7 +22,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
-from drakegrasp.dataset.assemble import file_attributes, object_columns, shards_sha256
+from drakegrasp.dataset.assemble import file_attributes, shards_sha256
 from drakegrasp.dataset.hdf5 import (
     DATA_TABLES,
     OF_CAMERA,
@@ -83,12 +83,8 @@ FILES: Mapping[str, tuple[Kinds, Tables]] = {
     **dict.fromkeys(DATA_FILES.values(), (OF_CAMERA, DATA_TABLES)),
     SCENES_FILE: (OF_SCENES, SCENE_TABLES),
 }
-#: Attributes of the state of a dataset that a file is of, a cause of other differences first;
-#: scenes have the first two.
-STATE = (
-    *("signature", "shards", "camera", "split_by", "versions", "fingers", "joints"),
-    *("config_hash", "seed", "K", "near", "far"),
-)
+#: Attributes that identify the state of a dataset that a file is of.
+STATE = ("signature", "shards")
 
 #: float32 rounds points within one or two metres by 1e-7 m; this leaves room for products.
 POSITION_TOLERANCE = 1e-5  # [m]
@@ -185,108 +181,100 @@ def _run(task: Task) -> list[Violation]:
 # Files
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Look:
-    """What the header of a file says.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Header:
+    """What a file says of itself.
 
     Attributes:
-        counts: Number of rows of each group whose layout is that of the schema.
         attributes: Attributes of the file.
-        found: Violations of the layout and of the attributes.
+        counts: Number of rows of each group whose layout is that of the schema; none if attributes
+            are broken.
+        mistakes: Whether attributes or layout differ from the schema.
+        other: Whether the file is of another state than the manifest and the shards.
     """
 
-    counts: Mapping[str, int]
     attributes: Mapping[str, Any]
-    found: list[Violation]
+    counts: Mapping[str, int]
+    mistakes: bool
+    other: bool
 
 
 def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     """Return what a dataset's manifest and the headers of its files show, and all tasks."""
-    manifest, looks = read_manifest(out), dict[str, _Look]()
-    found, other, seals = check_hand(manifest), list[Violation](), ""
+    manifest, seals, headers = read_manifest(out), "", dict[str, _Header]()
+    found = check_hand(manifest)
     with _reported(found, FILE_NAME, "objects of one group must be in one split"):
         manifest.homes()
-
-    # Headers, and the state that each file is of. A missing shard is found with its object.
-    with suppress(DataError):
+    with suppress(DataError):  # a missing shard is found with its object
         seals = shards_sha256(out, manifest)
     cameras = {name: camera for camera, name in DATA_FILES.items()}
     for name in FILES:
         if name == SCENES_FILE and not (out / name).exists():
             continue
         with _reported(found, name, "the file must be there, readable and of this schema"):
-            look = looks[name] = _header(out / name)
-            other += _other_state(
-                name, look, file_attributes(manifest, seals, cameras.get(name, ""))
-            )
-            found += look.found
+            due = file_attributes(manifest, seals, cameras.get(name, ""))
+            known = {key: value for key, value in due.items() if key != "shards" or seals}
+            headers[name] = _header(out / name, known, found)
 
+    units = zip(manifest.objects, manifest.headers_by_object(), strict=True)
+    tasks: list[Task] = [partial(_check_object, out, entry, own) for entry, own in units]
     # Samples are compared with trials and meshes of the same state.
-    trials = looks.get(TRIALS_FILE)
-    known = {} if trials is None or trials.found or other else trials.counts
-    tasks: list[Task] = [
-        partial(_check_object, out, entry, headers)
-        for entry, headers in zip(manifest.objects, manifest.headers_by_object(), strict=True)
-    ]
-    for name, look in looks.items():
-        compared = bool(known) and name in cameras and not look.found
+    trials = headers.get(TRIALS_FILE)
+    sound = trials is not None and not trials.mistakes
+    sound = sound and not any(header.other for header in headers.values())
+    for name, header in headers.items():
+        compared = sound and name in cameras and not header.mistakes
         if compared:
             tasks.append(partial(_samples, out / name))
         tasks.append(partial(_seal, out / name))
-        now, counts = stamp(out / name), {**(known if compared else {}), **look.counts}
-        for group, count in look.counts.items():
-            for start in range(0, count, TASK_ROWS):
-                task = RowsTask(
-                    path=out / name,
-                    stamp=now,
-                    group=group,
-                    rows=slice(start, min(start + TASK_ROWS, count)),
-                    fields=FILES[name][1][group],
-                    attributes=look.attributes,
-                    counts=counts,
-                    dataset=manifest if compared or (known and name == TRIALS_FILE) else None,
-                )
-                tasks.append(partial(_check_rows, task))
-    return found + other, tasks
+        rows = _Rows(
+            path=out / name,
+            stamp=stamp(out / name),
+            attributes=header.attributes,
+            counts={**(trials.counts if compared and trials else {}), **header.counts},
+            max_distance=manifest.config.filters.max_surface_distance if compared else None,
+        )
+        tasks += [
+            partial(_check_rows, replace(rows, group=group, start=start, stop=start + TASK_ROWS))
+            for group, count in header.counts.items()
+            for start in range(0, count, TASK_ROWS)
+        ]
+    return found, tasks
 
 
-def _header(path: Path) -> _Look:
-    """Check the attributes and the layout of a file; no row is read."""
+def _header(path: Path, due: Mapping[str, Any], found: list[Violation]) -> _Header:
+    """Check the attributes and the layout of a file; no row is read.
+
+    Args:
+        path: Path of the file.
+        due: The attributes that the file would be written with now, as far as they are known.
+        found: Gets the violations.
+    """
     kinds, tables = FILES[path.name]
     with open_hdf5(path) as file:
         validate_schema_version(path, file.attrs.get("schema_version"))
         mistakes, layout = list(attribute_mistakes(file, kinds)), list(differences(file, tables))
         # A group with an invalid column is not read; without sound attributes, nothing is.
         broken = {*tables} if mistakes else {each.path[1:].split("/")[0] for each in layout}
-        return _Look(
-            counts={g: len(file[g][tables[g][0].name]) for g in tables if g not in broken},
-            attributes=dict(file.attrs),
-            found=[
-                Violation(file=path.name, group=each.path, what=each.what, got=each.got)
-                for each in (*mistakes, *layout)
-            ],
-        )
+        counts = {g: len(file[g][tables[g][0].name]) for g in tables if g not in broken}
+        attributes = dict(file.attrs)
+    for each in (*mistakes, *layout):
+        found.append(Violation(file=path.name, group=each.path, what=each.what, got=each.got))
 
-
-def _other_state(name: str, look: _Look, due: Mapping[str, Any]) -> Iterator[Violation]:
-    """The attributes of a file are those of the manifest and of the shards.
-
-    Args:
-        name: Name of the file.
-        look: Its header.
-        due: The attributes that the file would be written with now; `shards` is empty if a shard is
-            missing.
-    """
-    scenes, of = name == SCENES_FILE, {"shards": "the shards that are there"}
-    for key in STATE[:2] if scenes else STATE:
-        told = key in due and key in look.attributes and (key != "shards" or due[key])
-        if told and not np.array_equal(look.attributes[key], due[key]):
-            yield Violation(
-                file=name,
-                what=f"attribute {key} must be that of {of.get(key, FILE_NAME)}",
-                got=f"another; run `drakegrasp {'scenes' if scenes else 'assemble'}` again",
-            )
-            return  # other differences follow from this one
+    # The first other attribute is the cause of the others. Verdicts may get other settings, which
+    # are in `config`; scenes have their own attributes.
+    keys = STATE if path.name == SCENES_FILE else dict.fromkeys((*STATE, *due))
+    told = [key for key in keys if key in due and key in attributes and key != "config"]
+    other = next((key for key in told if not np.array_equal(attributes[key], due[key])), "")
+    if other:
+        of = "the shards that are there" if other == "shards" else FILE_NAME
+        command = "scenes" if path.name == SCENES_FILE else "assemble"
+        again = f"another; run `drakegrasp {command}` again"
+        what = f"attribute {other} must be that of {of}"
+        found.append(Violation(file=path.name, what=what, got=again))
+    return _Header(
+        attributes=attributes, counts=counts, mistakes=bool(mistakes or layout), other=bool(other)
+    )
 
 
 def _seal(path: Path) -> list[Violation]:
@@ -364,42 +352,45 @@ def _reported(found: list[Violation], name: str, what: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RowsTask:
+class _Rows:
     """Some rows to check, in any process.
 
     Attributes:
         path: Path of the file, whose layout is that of the schema.
         stamp: State of the file, see `drakegrasp.dataset.trials.stamp`.
-        group: Name of the group.
-        rows: Range of the rows.
-        fields: Fields of the group.
         attributes: Attributes of the file.
         counts: Number of rows of the groups that the group's rows refer to, as far as known.
-        dataset: Manifest of the dataset around trials, whose objects are compared with it, or
-            around a data file, whose samples are compared with their trials and meshes; None to
-            check the rows by themselves.
+        max_distance: Largest distance of a contact from the object's mesh [m]; None if samples are
+            not to be compared with their trials and meshes.
+        group: Name of the group.
+        start, stop: Range of the rows; the group may end before.
     """
 
     path: Path
     stamp: Stamp
-    group: str
-    rows: slice
-    fields: tuple[Field, ...]
     attributes: Mapping[str, Any]
     counts: Mapping[str, int]
-    dataset: Manifest | None = None
+    max_distance: float | None
+    group: str = ""
+    start: int = 0
+    stop: int = 0
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """Fields of the group."""
+        return FILES[self.path.name][1][self.group]
 
 
 #: The words of a rule, the rows (n,) that break it, and what they have instead (n, ...).
 Finding: TypeAlias = tuple[str, AnyArray, AnyArray]
 #: A check of the rows of a task: a table with their columns, without images that have no limits,
 #: and the column NUMBER.
-RowCheck: TypeAlias = Callable[[Table, RowsTask], Iterator[Finding]]
+RowCheck: TypeAlias = Callable[[Table, _Rows], Iterator[Finding]]
 #: Column of the number of each row in its group; no field has this name.
 NUMBER = "#"
 
 
-def _check_rows(task: RowsTask) -> list[Violation]:
+def _check_rows(task: _Rows) -> list[Violation]:
     """Return the rules that some rows break.
 
     Raises:
@@ -407,25 +398,25 @@ def _check_rows(task: RowsTask) -> list[Violation]:
     """
     # The seal proves that images are intact, and no rule here is about their colours and depths.
     names = [f.name for f in task.fields if not (f.sample and f.limits is None)]
-    name, group = task.path.name, f"/{task.group}"
+    violation = partial(Violation, file=task.path.name, group=f"/{task.group}")
     with reopened(task.path, task.stamp, "a file of a dataset") as file:
+        group = file[task.group]
         try:
-            own = [name for name in names if name in file[task.group]]
-            t = read_columns(file[task.group], task.fields, own, task.rows)
+            own, rows = [n for n in names if n in group], slice(task.start, task.stop)
+            t = read_columns(group, task.fields, own, rows)
         except Exception as error:
             if not says_damage(error):
                 raise
-            what = f"rows {task.rows.start} to {task.rows.stop - 1} must be readable"
-            return [Violation(file=name, group=group, what=what, got=first_line(error))]
+            last = min(task.stop, task.counts[task.group]) - 1
+            what = f"rows {task.start} to {last} must be readable"
+            return [violation(what=what, got=first_line(error))]
 
-    t = t.with_columns({NUMBER: np.arange(task.rows.start, task.rows.stop)})
+    t = t.with_columns({NUMBER: task.start + np.arange(t.count)})
     stages: list[list[RowCheck]] = [[_numbers], [_complete, _limits], [_rigid, _derived]]
     if task.group in SPLITS:
         stages += [[_chain], [_in_mask]]
-        if task.dataset is not None:
-            stages += [[_of_sample], [_as_in_trials], [_on_mesh]]
-    elif task.group == "objects" and task.dataset is not None:
-        stages += [[_as_in_manifest]]
+        if task.max_distance is not None:
+            stages += [[_as_in_trials], [_on_mesh]]
     found = list[Violation]()
     for checks in stages:
         sound = np.ones(t.count, dtype=np.bool_)
@@ -435,17 +426,9 @@ def _check_rows(task: RowsTask) -> list[Violation]:
             break  # what it is compared with has a violation of its own
         for what, bad, got in findings:
             if bad.any():
-                first = int(np.argmax(bad))
-                found.append(
-                    Violation(
-                        file=name,
-                        group=group,
-                        row=int(t[NUMBER][first]),
-                        more=int(bad.sum()) - 1,
-                        what=what,
-                        got=_said(np.asarray(got)[first]),
-                    )
-                )
+                first, more = int(np.argmax(bad)), int(bad.sum()) - 1
+                row, said = int(t[NUMBER][first]), _said(np.asarray(got)[first])
+                found.append(violation(row=row, more=more, what=what, got=said))
                 sound &= ~bad
         t = t[sound]
     return found
@@ -462,7 +445,7 @@ def _any(values: AnyArray) -> AnyArray:
     return np.asarray(values.any(axis=tuple(range(1, values.ndim))))
 
 
-def _read_fields(t: Table, task: RowsTask) -> Iterator[Field]:
+def _read_fields(t: Table, task: _Rows) -> Iterator[Field]:
     """Yield the fields that were read."""
     return (f for f in task.fields if t.has(f.name))
 
@@ -470,7 +453,7 @@ def _read_fields(t: Table, task: RowsTask) -> Iterator[Field]:
 # What the table of fields says of any group
 
 
-def _numbers(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _numbers(t: Table, task: _Rows) -> Iterator[Finding]:
     """Numbers of rows are those of rows, and codes have a meaning."""
     if task.group == "trials":
         values = t["trial_id"]
@@ -485,7 +468,7 @@ def _numbers(t: Table, task: RowsTask) -> Iterator[Finding]:
             yield what, ~np.isin(t[name], known), t[name]
 
 
-def _stage(t: Table, task: RowsTask) -> AnyArray:
+def _stage(t: Table, task: _Rows) -> AnyArray:
     """Return the stage (n,) that each row reached; a sample reached the last one."""
     if task.group != "trials":
         return np.full(t.count, Stage.LIFTED.value)
@@ -496,14 +479,14 @@ def _stage(t: Table, task: RowsTask) -> AnyArray:
     return np.where(late, Stage.LIFTED.value, reached)
 
 
-def _touching(t: Table, task: RowsTask, field: Field) -> AnyArray:
+def _touching(t: Table, task: _Rows, field: Field) -> AnyArray:
     """Return which fingers (n, k) have a contact at the time of a field."""
     if task.group == "trials":
         return t["lifted_touching" if "lifted" in field.name else "closed_touching"]
     return ~unused_fingers(t["grasp_props/unused"], t["grasps"].shape[1] // 6)
 
 
-def _complete(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _complete(t: Table, task: _Rows) -> Iterator[Finding]:
     """Fields have values from their stage on, and no values before it."""
     if task.group not in COMPLETE:
         return
@@ -536,7 +519,7 @@ def _complete(t: Table, task: RowsTask) -> Iterator[Finding]:
             yield f"{f.name} must be finite {where}", bad, values
 
 
-def _limits(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _limits(t: Table, task: _Rows) -> Iterator[Finding]:
     """Values are within the limits of their fields; NaN has no limits."""
     for f in _read_fields(t, task):
         if f.limits is not None:
@@ -550,7 +533,7 @@ def _limits(t: Table, task: RowsTask) -> Iterator[Finding]:
             yield f"{f.name} must be {what}", bad.any(axis=1), worst
 
 
-def _rigid(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _rigid(t: Table, task: _Rows) -> Iterator[Finding]:
     """Poses are rigid motions, and normals have length one; NaN means that there is no value."""
     count = t.count
     for f in _read_fields(t, task):
@@ -570,7 +553,7 @@ def _rigid(t: Table, task: RowsTask) -> Iterator[Finding]:
             yield f"normals in {f.name} must have length 1", bad, length
 
 
-def _derived(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _derived(t: Table, task: _Rows) -> Iterator[Finding]:
     """Derived fields have the values that the schema derives from other fields."""
     for f in _read_fields(t, task):
         if f.derive is not None and t.has(*f.needs):
@@ -597,20 +580,6 @@ def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) ->
     return _any(~(same | near))
 
 
-def _as_in_manifest(t: Table, task: RowsTask) -> Iterator[Finding]:
-    """Rows of /objects are the objects of the manifest."""
-    assert task.dataset is not None
-    due, count = object_columns(task.dataset), len(task.dataset.objects)
-    if task.counts[task.group] != count:
-        what = f"the group must have the {count} objects of {FILE_NAME}"
-        yield what, np.ones(t.count, dtype=np.bool_), np.full(t.count, task.counts[task.group])
-        return
-    for name, values in due.items():
-        if t.has(name):
-            bad = _differs(t[name], values[t[NUMBER]])
-            yield f"{name} must be that of {FILE_NAME}", bad, t[name]
-
-
 # What samples are
 
 
@@ -619,7 +588,7 @@ def _pose(t: Table, name: str) -> Array:
     return unpack_pose(t[f"object_props/{name}"].astype(float))
 
 
-def _X_CW(t: Table, task: RowsTask) -> Array:
+def _X_CW(t: Table, task: _Rows) -> Array:
     """Return the poses (n, 4, 4) of the world in the frame of the file's camera."""
     return _pose(t, f"frame_cam2work_{task.attributes['camera']}") @ invert_pose(X_WT)
 
@@ -630,7 +599,7 @@ def _contacts(t: Table) -> tuple[Array, Array]:
     return vectors[:, 0], vectors[:, 1]
 
 
-def _chain(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _chain(t: Table, task: _Rows) -> Iterator[Finding]:
     """The frames of a sample agree: the table, and both cameras with their inverses."""
     what = f"frame_world2work must be the identity at {X_WT[:3, 3].tolist()} m"
     apart = {what: _pose(t, "frame_world2work") - X_WT}
@@ -645,13 +614,7 @@ def _chain(t: Table, task: RowsTask) -> Iterator[Finding]:
         yield what, off > POSITION_TOLERANCE, off
 
 
-def _of_sample(t: Table, task: RowsTask) -> Iterator[Finding]:
-    """The trial of a sample is a success that no filter removes."""
-    kept = Trials(task.path.parent)[t["trial_id"]]["removal"] == Removal.KEPT
-    yield "trial_id must be that of a sample", ~kept, t["trial_id"]
-
-
-def _as_in_trials(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _as_in_trials(t: Table, task: _Rows) -> Iterator[Finding]:
     """A sample repeats the numbers of its trial, and its poses follow from those of the trial."""
     copied = {f.name: f.of for f in _read_fields(t, task) if f.of}
     trials = Trials(task.path.parent)[t["trial_id"]]
@@ -667,7 +630,7 @@ def _as_in_trials(t: Table, task: RowsTask) -> Iterator[Finding]:
         yield f"{name} must follow from its trial", bad, t[name]
 
 
-def _in_mask(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _in_mask(t: Table, task: _Rows) -> Iterator[Finding]:
     """Contacts are before the camera, and project onto the object in the image."""
     (p_CQ, _), K = _contacts(t), task.attributes["K"]
     off = np.zeros(p_CQ.shape[:2])
@@ -680,13 +643,12 @@ def _in_mask(t: Table, task: RowsTask) -> Iterator[Finding]:
     yield what, np.any(off > MASK_TOLERANCE, axis=1), off
 
 
-def _on_mesh(t: Table, task: RowsTask) -> Iterator[Finding]:
+def _on_mesh(t: Table, task: _Rows) -> Iterator[Finding]:
     """Contacts are on the object's mesh, and their normals point out of it.
 
     A normal counts as outward if it agrees with either of the faces of `ContactFit.normal_angle`.
     """
-    assert task.dataset is not None
-    limit = task.dataset.config.filters.max_surface_distance
+    assert task.max_distance is not None
     X_OC = invert_pose(_X_CW(t, task) @ _pose(t, "frame_world2obj"))
     p_CQ, nhat_Q_C = _contacts(t)
     off, angle = np.zeros((2, *p_CQ.shape[:2]))
@@ -703,8 +665,8 @@ def _on_mesh(t: Table, task: RowsTask) -> Iterator[Finding]:
             fit = fit_contacts(model, p_OQ, rotate_vectors(X_OC[i], nhat_Q_C[i]))
             off[i], angle[i] = fit.distance, np.degrees(fit.normal_angle)
 
-    beyond = off > limit + POSITION_TOLERANCE
-    what = f"contacts must be on the object's mesh within {limit:g} m"
+    beyond = off > task.max_distance + POSITION_TOLERANCE
+    what = f"contacts must be on the object's mesh within {task.max_distance:g} m"
     yield what, beyond.any(axis=1), off
     what = "normals must point out of the object, within 90 deg of its face's"
     yield what, ((angle > 90.0) & ~beyond).any(axis=1), angle

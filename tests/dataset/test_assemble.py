@@ -20,7 +20,7 @@ from drakegrasp.dataset import assemble as module
 from drakegrasp.dataset import hdf5, shards
 from drakegrasp.dataset.assemble import assemble, survey
 from drakegrasp.dataset.manifest import read_manifest, with_postprocessing
-from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS
 from drakegrasp.dataset.successes import in_image
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
@@ -66,6 +66,16 @@ def test_shards_without_a_column_that_they_may_lack_are_assembled(out: Path) -> 
             del file["trials/unused"]
         seal(path)
     assert assemble(out).removed == {Removal.KEPT: 9}
+
+
+def test_objects_are_those_of_the_manifest(sound: Path) -> None:
+    entries = read_manifest(sound).objects
+    with h5py.File(sound / TRIALS) as file:
+        for field in OBJECT_FIELDS:
+            column = file["objects"][field.name]
+            values = column.asstr()[:] if field.dtype == "str" else column[:]
+            due = [getattr(entry, field.name) for entry in entries]
+            np.testing.assert_array_equal(values, [np.nan if v is None else v for v in due])
 
 
 def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:

@@ -29,7 +29,6 @@ from helpers.datasets import (
 
 from drakegrasp.dataset.assemble import IMAGES
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import DATA_FIELDS
 from drakegrasp.frames import invert_pose, pack_pose, unpack_pose
 
@@ -103,33 +102,6 @@ def test_a_removal_without_a_meaning_is_found(out: Path) -> None:
     must_find(out, (TRIALS, "/successes", 2, "removal must be one of 0, 1, 2"))
 
 
-def test_objects_of_trials_are_those_of_the_manifest(out: Path) -> None:
-    edits = {"name": lambda _: b"a\x1b]0;x\x07", "mass": lambda mass: 2.0 * mass}
-    for name, edit in edits.items():
-        change(out, TRIALS, f"objects/{name}", 1, edit)
-    must_find(
-        out,
-        *((TRIALS, "/objects", 1, f"{name} must be that of manifest.json") for name in edits),
-        of=TRIALS,
-    )
-
-
-def test_trials_have_the_objects_of_the_manifest_alone(out: Path) -> None:
-    def add(file: h5py.File) -> None:
-        group = file["objects"]
-        for name in [*group]:
-            values, attrs = group[name][:], dict(group[name].attrs)
-            dtype = group[name].dtype
-            del group[name]
-            group.create_dataset(name, data=np.append(values, values[:1]), dtype=dtype)
-            group[name].attrs.update(attrs)
-
-    count = len(read_manifest(out).objects)
-    edit_file(out / TRIALS, add)
-    what = f"the group must have the {count} objects of manifest.json"
-    must_find(out, (TRIALS, "/objects", 0, what), of=TRIALS)
-
-
 PROPS, GRASP = "object_props/", "grasp_props/"
 SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
     # where it is, how it is broken, what is found
@@ -182,7 +154,6 @@ SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
         lambda g: np.hstack([g[:9], -g[9:12], g[12:]]),
         "normals must point out of the object",
     ),
-    "no sample": (OTM, "trial_id", lambda _: MISSING, "trial_id must be that of a sample"),
     "no trial": (OTM, "trial_id", lambda _: 36, "trial_id must be one of the rows of /trials"),
 }
 #: Where the samples of a file are.
