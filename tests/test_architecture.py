@@ -60,7 +60,7 @@ WALLS = {
     "mujoco": ("mjcf", "hand.draft.mujoco_model", "protocols.scene", "exchange.mjcf"),
     "coacd": ("mjcf",),
     "pyarrow": ("exchange.hub",),
-    "torch": ("dataset.torch_samples",),
+    "torch": ("dataset.reader",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {

@@ -1,4 +1,6 @@
-"""Reading a dataset. Imports h5py and NumPy, but not Drake, trimesh, Dask or torch.
+"""Reading a dataset. Imports h5py and NumPy, but not Drake, trimesh or Dask.
+
+torch is imported when samples become tensors.
 
 >>> data = GraspDataset("OUT/grasping_oto.hdf5", split="train")   # doctest: +SKIP
 >>> data[0].image.shape, data[0].grasp.shape                      # doctest: +SKIP
@@ -35,7 +37,7 @@ from drakegrasp.foreign_files import validate_local
 from drakegrasp.grasp import unused_fingers
 
 if TYPE_CHECKING:
-    from drakegrasp.dataset.torch_samples import TorchSamples
+    import torch
 
 #: The fields of a sample, by name.
 FIELDS = {field.name: field for field in DATA_FIELDS}
@@ -227,7 +229,7 @@ class GraspDataset:
             raise self._as_damage(error) from None
 
     def to_torch(self, fields: Sequence[str] = ("images", "grasps")) -> TorchSamples:
-        """Return the split as a `torch.utils.data.Dataset` of tensors.
+        """Return the split as tensors, for `torch.utils.data.DataLoader`.
 
         Args:
             fields: Names of the fields of a sample, as `column` takes them.
@@ -239,8 +241,6 @@ class GraspDataset:
         _validate_fields(fields)
         if find_spec("torch") is None:
             raise MachineError("to_torch needs torch, got none: pip install 'drakegrasp[torch]'")
-        from drakegrasp.dataset.torch_samples import TorchSamples
-
         return TorchSamples(self, fields)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -294,6 +294,47 @@ class GraspDataset:
         if self._file is not None:
             self._file.close()
         self._file, self._fields, self._process = None, {}, -1
+
+
+class TorchSamples:
+    """Samples as dictionaries from field names to tensors of torch; a text field is a str.
+
+    It has the interface of `torch.utils.data.Dataset`: torch collates the items and moves them
+    between processes. Each process opens the file itself, and keeps the fields that are not images
+    in memory: 72 bytes a sample for `grasps`.
+
+    Args:
+        data: The split.
+        fields: Names of the fields, as `GraspDataset.column` takes them.
+
+    Attributes:
+        data, fields: The arguments.
+    """
+
+    def __init__(self, data: GraspDataset, fields: Sequence[str]) -> None:
+        self.data, self.fields = data, tuple(fields)
+        self._columns: dict[str, npt.NDArray[Any]] = {}
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        row = self.data.row_of(index)
+        return {name: self._value(name, row) for name in self.fields}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_columns": {}}
+
+    def _value(self, name: str, row: int) -> torch.Tensor | str:
+        """Return a field of a sample; a tensor is a copy that the caller may change."""
+        import torch
+
+        if FIELDS[name].sample:
+            return torch.from_numpy(self.data.value(name, row))
+        if name not in self._columns:
+            self._columns[name] = self.data.column(name)
+        value = self._columns[name][row]
+        return str(value) if isinstance(value, str) else torch.from_numpy(np.array(value))
 
 
 #: Readers with an open file, opened here or in the process from which this one was forked.

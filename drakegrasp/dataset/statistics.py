@@ -96,41 +96,33 @@ def count_funnel(out: Path) -> Funnel:
         DataError: If trials.hdf5 is missing or damaged.
     """
     trials = Trials(out)
-    count = len(trials.objects["name"])
-
-    def zeros(*shape: int) -> npt.NDArray[np.int64]:
-        return np.zeros(shape, dtype=np.int64)
-
-    funnel = Funnel(
-        names=tuple(trials.objects["name"].tolist()),
-        classes=tuple(trials.objects["class_name"].tolist()),
-        candidates=zeros(count),
-        outcomes=zeros(count, 1 + max(Outcome)),
-        precision=zeros(count),
-        stable=zeros(count),
-        removals=zeros(count, 1 + max(Removal)),
-        elevations=zeros(count, len(BANDS)),
-        approach_cells=zeros(count),
-    )
-
-    # The attempts, in blocks of some thousand.
-    for block in trials.blocks(_COUNTED):
-        number, removal = block["object"], block["removal"]
-        _count(funnel.candidates, number[block["standoff_index"] == 0])
-        _count(funnel.outcomes, (number, block["outcome"]))
-        _count(funnel.precision, number[block["precision"]])
-        _count(funnel.stable, number[block["stable"]])
-        decided = removal != NONE
-        _count(funnel.removals, (number[decided], removal[decided]))
+    names, classes = (tuple(trials.objects[key].tolist()) for key in ("name", "class_name"))
+    count, rows = len(names), Table(trials.columns(_COUNTED))
+    held = rows[rows.removal != NONE]
 
     # From where the palms of the samples approach.
     samples = _samples(trials)
+    own = samples[samples.distinct]
+    bands = elevation_bands(multiply(own.X_TO, own.X_OG))
     cells = np.unique(np.column_stack([samples.objects, approach_cells(samples.X_OG)]), axis=0)
-    _count(funnel.approach_cells, cells[:, 0])
-    bands = elevation_bands(multiply(samples.X_TO, samples.X_OG))
-    own = samples.distinct
-    _count(funnel.elevations, (samples.objects[own], bands[own]))
-    return funnel
+
+    return Funnel(
+        names=names,
+        classes=classes,
+        candidates=_count((count,), rows.object[rows.standoff_index == 0]),
+        outcomes=_count((count, 1 + max(Outcome)), rows.object, rows.outcome),
+        precision=_count((count,), rows.object[rows.precision]),
+        stable=_count((count,), rows.object[rows.stable]),
+        removals=_count((count, 1 + max(Removal)), held.object, held.removal),
+        elevations=_count((count, len(BANDS)), own.objects, bands),
+        approach_cells=_count((count,), cells[:, 0]),
+    )
+
+
+def _count(shape: tuple[int, ...], *cells: AnyArray) -> npt.NDArray[np.int64]:
+    """Return how often each cell of an array of a shape occurs among cells, by its indices."""
+    flat = np.ravel_multi_index(cells, shape)
+    return np.bincount(flat, minlength=np.prod(shape)).reshape(shape)
 
 
 def _samples(trials: Trials) -> Table:
@@ -155,12 +147,6 @@ def distinct_samples(trials: Trials) -> npt.NDArray[np.int64]:
     """
     samples = _samples(trials)
     return samples.ids[samples.distinct]
-
-
-def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
-    """Add to an array of counts how often each of its cells occurs."""
-    flat = np.ravel_multi_index(cells, counts.shape) if counts.ndim > 1 else cells
-    counts += np.bincount(flat, minlength=counts.size).reshape(counts.shape)
 
 
 def held_note(funnel: Funnel) -> str:
