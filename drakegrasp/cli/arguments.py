@@ -112,6 +112,26 @@ GraspFrame: TypeAlias = Literal["object", "table", "camera", "world", "mesh"]
 AsJson: TypeAlias = Annotated[bool, Parameter(name="--json")]
 
 
+@Parameter(name="*", group=MORE)
+@dataclass(frozen=True, kw_only=True)
+class Postures:
+    """How files of postures are read.
+
+    Attributes:
+        link: Frame or link of the poses in files of postures, which overrides the files: palm, the
+            palm link, or a frame of another tool that the hand file names, e.g. graspgen.
+        preshape: Preshape for rows of postures that name none; the value each, for palm poses
+            alone, tries all preshapes in turn.
+    """
+
+    link: Name | None = None
+    preshape: Name | None = None
+
+    def asked(self) -> dict[str, str]:
+        """Return the arguments of `exchange.attempts.read_attempts` that these options state."""
+        return given(link=self.link, preshape=self.preshape)
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class What:
@@ -137,10 +157,6 @@ class What:
             of the meshes]
         postures: Try these postures (wrist and joints) instead of drawn palm poses, on the objects
             that the postures name: .npz, .hdf5, DexGraspBench .npy or isaac_grasp .yaml.
-        link: Frame or link of the poses in files of postures, which overrides the files: palm, the
-            palm link, or a frame of another tool that the hand file names, e.g. graspgen.
-        preshape: Preshape for rows of postures that name none; the value each, for palm poses
-            alone, tries all preshapes in turn.
     """
 
     objects: Annotated[str, Parameter(metavar="MESH_DIR|builtin")]
@@ -158,8 +174,7 @@ class What:
     objects_seed: Annotated[Count | None, Parameter(group=MORE)] = None
     manifest: Annotated[AnyPath | None, Parameter(group=MORE, metavar="FILE")] = None
     postures: Annotated[Existing | None, Parameter(group=MORE, metavar="FILE|DIR")] = None
-    link: Annotated[Name | None, Parameter(group=MORE)] = None
-    preshape: Annotated[Name | None, Parameter(group=MORE)] = None
+    reading: Postures = Postures()
 
     def asked(self) -> dict[str, Any]:
         """Return the arguments of `build_dataset` and `known_work` that these options state.
@@ -169,7 +184,7 @@ class What:
             ConfigError: If a value of the configuration cannot be used.
             HandError: If the hand's file cannot be read.
         """
-        read_as = given(link=self.link, preshape=self.preshape)
+        read_as = self.reading.asked()
         if read_as and self.postures is None:
             raise UsageError(f"--{next(iter(read_as))} must be used with --postures")
         asked = {name: getattr(self, name) for name in ("objects", "units", "manifest", "only")}

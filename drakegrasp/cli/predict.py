@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -31,6 +31,27 @@ KINDS = {
 }
 #: Number of grasps for one object that are lifted if it is not given; scenes have many views.
 SIMULATED = 5
+Metres: TypeAlias = Annotated[float, Parameter(metavar="METRES", validator=Number(gt=0.0))]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class DepthImage:
+    """What makes a depth image a view of one object.
+
+    Attributes:
+        camera: Camera matrix of a depth image in pixels: four numbers, or a file with K or with fx,
+            fy, cx and cy.
+        mask: Image or .npy of the size of the depth image: 0, and one other value on the object.
+        camera_pose: .npy file with the pose of the camera over the table, X_TC, as (4, 4).
+            [default: from the plane on which the object stands]
+        depth_scale: Unit of a .png depth image. [default: 0.001]
+    """
+
+    camera: Annotated[str | None, Parameter(metavar="FX,FY,CX,CY|JSON")] = None
+    mask: File | None = None
+    camera_pose: File | None = None
+    depth_scale: Metres | None = None
 
 
 def predict(
@@ -43,12 +64,7 @@ def predict(
     overrides: Settings = (),
     split: Split | None = None,
     units: Units | None = None,
-    camera: Annotated[str | None, Parameter(metavar="FX,FY,CX,CY|JSON")] = None,
-    mask: File | None = None,
-    camera_pose: File | None = None,
-    depth_scale: Annotated[
-        float | None, Parameter(metavar="METRES", validator=Number(gt=0.0))
-    ] = None,
+    image: DepthImage = DepthImage(),
     workers: Count | None = None,
     quiet: bool = False,
 ) -> None:
@@ -77,57 +93,26 @@ def predict(
             hand=allegro or objects.mass=0.3; may be given several times.
         split: Views of scenes. [default: test]
         units: Unit of length of a cloud. [default: m]
-        camera: Camera matrix of a depth image in pixels: four numbers, or a file with K or with fx,
-            fy, cx and cy.
-        mask: Image or .npy of the size of the depth image: 0, and one other value on the object.
-        camera_pose: .npy file with the pose of the camera over the table, X_TC, as (4, 4).
-            [default: from the plane on which the object stands]
-        depth_scale: Unit of a .png depth image. [default: 0.001]
         workers: Number of processes for scenes. [default: one per core]
         quiet: Show neither progress nor what to expect.
     """
-    import numpy as np
-
     from drakegrasp.exchange.attempts import write_attempts
-    from drakegrasp.hand.description import load_hand
-    from drakegrasp.scoring.predicting import predict as predict_grasps
 
     # All input is checked before anything is predicted.
     _validate_place(out, source)
-    options: dict[str, Any] = {
-        "split": split,
-        "workers": workers,
-        "units": units,
-        "camera": camera,
-        "mask": mask,
-    }
-    options |= {"camera_pose": camera_pose, "depth_scale": depth_scale}
-    kind = _kind_of(source, camera)
-    _validate_options(kind, options)
-
-    # Scenes have many objects, the other kinds one.
+    kind = _kind_of(source, image.camera)
+    _validate_options(kind, {"split": split, "units": units, "workers": workers, **vars(image)})
+    how: dict[str, Any] = {"overrides": overrides, "count": count, "show": not quiet}
     if kind == "scenes":
-        found, hand = _of_scenes(
-            source, split or "test", simulate or 0, count, overrides, workers, show=not quiet
-        )
-        write_attempts(out, found, hand)
-        say(str(out))
-        return
-    config = dg.load_config("fast", list(overrides))
-    view, cloud = None, None
-    if kind == "a cloud":
-        cloud = _read_cloud(source, units or "m")
+        found, hand = _of_scenes(source, split or "test", simulate or 0, workers, **how)
     else:
-        assert camera is not None and mask is not None
-        depth = _read_depth(source, depth_scale)
-        cloud, view = _see(source, depth, camera, mask, camera_pose, show=not quiet)
-    tries = SIMULATED if simulate is None else simulate
-    found, ranking = predict_grasps(cloud, view, config, simulate=tries, count=count)
-    pose = None if view is None else np.asarray(view.X_TC)
-    write_attempts(out, _seen_from(found, pose), load_hand(config.hand_source))
+        tries = SIMULATED if simulate is None else simulate
+        if kind == "a cloud":
+            found, hand = _of_object(_read_cloud(source, units or "m"), None, tries, **how)
+        else:
+            found, hand = _of_object(*_see(source, image, show=not quiet), tries, **how)
+    write_attempts(out, found, hand)
     say(str(out))
-    if not quiet:
-        say(ranking.explain(), err=True)
 
 
 def _validate_place(out: Path, source: Path) -> None:
@@ -187,29 +172,52 @@ def _validate_options(kind: str, options: dict[str, Any]) -> None:
 
 
 def _of_scenes(
-    path: Path,
-    split: str,
-    simulate: int,
-    count: int | None,
-    overrides: tuple[str, ...],
-    workers: int | None,
-    *,
-    show: bool,
+    path: Path, split: str, simulate: int, workers: int | None, *, show: bool, **how: Any
 ) -> tuple[Attempts, Hand]:
     """Return the grasps for the views of a split and their hand; print how many there are."""
     from drakegrasp.scoring.predicting import predict_scenes
 
-    with processes(workers, "predict", "views", show=show) as how, wrong_input():
-        how["report"] = how.pop("progress")
-        found, blind, hand = predict_scenes(
-            path, split=split, simulate=simulate, count=count, overrides=overrides, **how
-        )
+    how |= {"split": split, "simulate": simulate}
+    with processes(workers, "predict", "views", show=show) as more, wrong_input():
+        how |= {"execute": more["execute"], "report": more["progress"]}
+        found, blind, hand = predict_scenes(path, **how)
     if show:
         views = len(set(found.of_row.tolist()))
         say(f"{len(found):,} grasps of {views:,} views", err=True)
     if blind:
         say(f"{blind:,} views show too little of their object: no grasp", err=True)
     return found, hand
+
+
+def _of_object(
+    cloud: Array,
+    view: View | None,
+    simulate: int,
+    *,
+    overrides: tuple[str, ...],
+    count: int | None,
+    show: bool,
+) -> tuple[Attempts, Hand]:
+    """Return the grasps for an object and their hand; print what to expect of them.
+
+    They are in {T}, or in the frame of the view's camera if there is a view.
+    """
+    import numpy as np
+
+    from drakegrasp.arithmetic import multiply
+    from drakegrasp.frames import invert_pose
+    from drakegrasp.scoring.predicting import predict as predict_grasps
+
+    config = dg.load_config("fast", list(overrides))
+    found, ranking = predict_grasps(cloud, view, config, simulate=simulate, count=count)
+    if view is not None:
+        X_TC = np.asarray(view.X_TC)
+        X_CG = multiply(invert_pose(X_TC), found.X_FG)
+        X_TC = X_TC[None].repeat(len(found), axis=0)
+        found = replace(found, X_FG=X_CG, frame="camera", X_TC=X_TC)
+    if show:
+        say(ranking.explain(), err=True)
+    return found, dg.load_hand(config.hand_source)
 
 
 def _read_cloud(path: Path, units: str) -> Array:
@@ -254,9 +262,7 @@ def _read_depth(path: Path, scale: float | None) -> Array:
     return depth
 
 
-def _see(
-    path: Path, depth: Array, camera: str, mask: Path, camera_pose: Path | None, *, show: bool
-) -> tuple[Array, View]:
+def _see(path: Path, image: DepthImage, *, show: bool) -> tuple[Array, View]:
     """Return the object's points (n, 3) in {T} [m], and the view that shows them.
 
     Raises:
@@ -268,10 +274,12 @@ def _see(
     from drakegrasp.vision import depth_image as images
     from drakegrasp.vision.depth_image import View
 
-    K, own, off = images.read_camera(camera, depth.shape), images.read_mask(mask), ""
-    if camera_pose is not None:
-        with named(camera_pose):
-            pose = read_pose(read_numbers(camera_pose), "X_TC")
+    assert image.camera is not None and image.mask is not None
+    depth = _read_depth(path, image.depth_scale)
+    K, own, off = images.read_camera(image.camera, depth.shape), images.read_mask(image.mask), ""
+    if image.camera_pose is not None:
+        with named(image.camera_pose):
+            pose = read_pose(read_numbers(image.camera_pose), "X_TC")
             share = images.table_share(depth, K, own, pose)
     else:
         with named(path):
@@ -283,14 +291,3 @@ def _see(
     with named(path):
         cloud = images.cloud_from_depth(depth, K, own, pose)
     return cloud, View(depth=depth, mask=own, K=images.read_lens(K), X_TC=pose)
-
-
-def _seen_from(found: Attempts, X_TC: Array | None) -> Attempts:
-    """Return grasps in {T} in the frame of a camera, if there is one."""
-    from drakegrasp.arithmetic import multiply
-    from drakegrasp.frames import invert_pose
-
-    if X_TC is None:
-        return found
-    X_CG = multiply(invert_pose(X_TC), found.X_FG)
-    return replace(found, X_FG=X_CG, frame="camera", X_TC=X_TC[None].repeat(len(found), axis=0))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -13,8 +15,8 @@ from drakegrasp.cli.arguments import (
     Existing,
     Folder,
     GraspFrame,
-    Name,
     Positive,
+    Postures,
     Settings,
     Split,
     Workers,
@@ -44,8 +46,7 @@ def score(
     quiet: bool = False,
     train: Annotated[DataFile | None, Parameter(group=MORE)] = None,
     frame: Annotated[GraspFrame | None, Parameter(group=MORE)] = None,
-    link: Annotated[Name | None, Parameter(group=MORE)] = None,
-    preshape: Annotated[Name | None, Parameter(group=MORE)] = None,
+    postures: Postures = Postures(),
     protocol: Annotated[str, Parameter(group=MORE, metavar="NAME|FILE.py:NAME")] = "lift",
     workers: Workers = Workers(),
 ) -> None:
@@ -76,17 +77,12 @@ def score(
         quiet: Show neither progress nor warnings.
         train: Data file whose training rows are used for the reference rows. [default: --dataset]
         frame: Frame of all postures, which overrides their files.
-        link: Frame or link of the poses in files of postures, which overrides the files: palm, the
-            palm link, or a frame of another tool that the hand file names, e.g. graspgen.
-        preshape: Preshape for rows of postures that name none; the value each, for palm poses
-            alone, tries all preshapes in turn.
         protocol: The rule of a verdict, see `drakegrasp verify`. All protocols except lift try the
             first wrist pose of a prediction in MuJoCo.
     """
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.scenes import open_rows
     from drakegrasp.exchange.attempts import holds_postures
-    from drakegrasp.scoring.card import share_text
     from drakegrasp.scoring.references import REFERENCES
 
     on = workers.asked()
@@ -107,23 +103,29 @@ def score(
         references=references,
         per_object=per_object,
         overrides=overrides,
-        read_as=given(frame=frame, link=link, preshape=preshape),
+        read_as=given(frame=frame) | postures.asked(),
         protocol=protocol,
         out=out,
         again=same_command(*IDLE),
         **on,
         show=not quiet,
     )
+    _say_card(scored.card, out, as_json=as_json, quiet=quiet)
+
+
+def _say_card(card: Mapping[str, Any], out: Path | None, *, as_json: bool, quiet: bool) -> None:
+    """Print the headlines of a card, or the card, and unless quiet all sets and warnings."""
+    from drakegrasp.scoring.card import share_text
 
     if as_json:
-        say_json(scored.card, indent=1)
+        say_json(card, indent=1)
     else:
-        for name, value in scored.card["headline"].items():
+        for name, value in card["headline"].items():
             say(f"{name}: {share_text(value, 1, ' %')}")
         if out is not None:
             say(str(out / "card.md"))
     if not quiet:
-        for name, each in scored.card["sets"].items():
+        for name, each in card["sets"].items():
             say(f"{name}: {share_text(each['measures']['headline'], 1, ' %')}", err=True)
-        for warning in scored.card["warnings"]:
+        for warning in card["warnings"]:
             say(f"warning: {warning}", err=True)

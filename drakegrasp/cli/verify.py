@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +17,7 @@ from drakegrasp.cli.arguments import (
     AsJson,
     DataFile,
     GraspFrame,
-    Name,
+    Postures,
     Preset,
     Settings,
     Split,
@@ -57,10 +57,6 @@ class Target:
         config: Configuration: a file, or the preset paper, fast, randomized or released. [default:
             that of the dataset, else the defaults]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
-        link: Frame or link of the poses in files of postures, which overrides the files: palm, the
-            palm link, or a frame of another tool that the hand file names, e.g. graspgen.
-        preshape: Preshape for rows of postures that name none; the value each, for palm poses
-            alone, tries all preshapes in turn.
     """
 
     mesh: Annotated[AnyPath | None, Parameter(name="--object", metavar="MESH")] = None
@@ -71,13 +67,12 @@ class Target:
     hand: Annotated[str | None, Parameter(metavar="NAME|YAML|XML")] = None
     config: Preset | None = None
     overrides: Settings = ()
-    link: Annotated[Name | None, Parameter(group=MORE)] = None
-    preshape: Annotated[Name | None, Parameter(group=MORE)] = None
+    reading: Postures = field(default_factory=Postures)
 
     @property
     def read_as(self) -> dict[str, str]:
         """What applies to all postures, see `exchange.attempts.read_attempts`."""
-        return given(frame=self.frame, link=self.link, preshape=self.preshape)
+        return given(frame=self.frame) | self.reading.asked()
 
     def refuse(self, where: str, *names: str) -> None:
         """Reject options that have no effect.
@@ -85,8 +80,9 @@ class Target:
         Raises:
             GraspError: If one is given.
         """
+        values, usual = vars(self) | vars(self.reading), vars(Target()) | vars(Postures())
         for name in names:
-            if (value := getattr(self, name)) != getattr(Target, name):
+            if (value := values[name]) != usual[name]:
                 option = {"mesh": "object", "overrides": "set"}.get(name, name).replace("_", "-")
                 got = ", ".join(value) if isinstance(value, tuple) else value
                 raise GraspError(f"--{option} must be left out {where}, got {got}")
