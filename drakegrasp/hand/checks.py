@@ -22,6 +22,7 @@ from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.description import FINGER_DAMPING, Hand, load_hand
+from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.finger_sweep import (
     Opposition,
     closing_path,
@@ -315,20 +316,17 @@ def check_order(hand: Hand) -> Finding:
 
 def check_pads(hand: Hand) -> Finding:
     """Return whether each pad is on its fingertip's surface and faces where the finger closes."""
-    # Check the distance of the pad points from the surface.
-    shapes, faults, areas = link_shapes(hand.model), [], []
-    facing = _facing(hand)
-    for i, (finger, pad) in enumerate(
-        zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True)
-    ):
-        parts = [hull_triangles(corners) for corners in shapes[finger.fingertip]]
+    # Motion of the pad points as the fingers close.
+    half, step = 0.5 * closed_positions(hand), 1e-4 * hand.closing_unit
+    motions = pad_points_at(hand, half + step) - pad_points_at(hand, half)
+    X_GF, shapes = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand.model)
+    pads, faults, areas = pad_surfaces(hand.model, hand.fingers), [], []
+    for i, (finger, pad) in enumerate(zip(hand.fingers, pads, strict=True)):
+        parts = shapes[finger.fingertip]
         if not parts:
             faults.append(f"link {finger.fingertip!r} must have a collision shape, got none")
             continue
-        triangles = np.concatenate(parts)
-        points = np.tile(finger.p_FiP, (len(triangles), 1))
-        near = trimesh.triangles.closest_point(triangles, points)
-        distance = float(np.linalg.norm(near - points, axis=1).min())
+        distance = _distances(np.concatenate([*map(hull_triangles, parts)]), finger.p_FiP).min()
         if distance > ON_SURFACE:
             faults.append(
                 f"fingers.{i}.pad_point must lie on the surface of link {finger.fingertip!r}, "
@@ -336,7 +334,8 @@ def check_pads(hand: Hand) -> Finding:
             )
 
         # The pad must face the direction of its motion.
-        if facing[i] <= 0.0:
+        normal = X_GF[i, :3, :3] @ _mean_normal(finger, pad, np.concatenate(parts).mean(axis=0))
+        if normal @ motions[i] <= 0.0:
             faults.append(
                 f"the pad of finger {finger.name!r} must face where the finger closes, got its "
                 "back: check the pad_region, and the axis of the closing joint, which must close "
@@ -346,41 +345,25 @@ def check_pads(hand: Hand) -> Finding:
     return judge("pads", faults, f"{', '.join(f'{area:.0f}' for area in areas)} mm²")
 
 
-def _normals(triangles: Array) -> Array:
-    """Return the normals (n, 3) of triangles (n, 3, 3), as long as twice their areas."""
-    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-
-
-def _face_at(triangles: Array, point: Array) -> Array:
-    """Return the triangles among (n, 3, 3) that are closest to a point (3,) [m]."""
+def _distances(triangles: Array, point: Array) -> Array:
+    """Return the distances (n,) of triangles (n, 3, 3) from a point (3,) [m]."""
     near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
-    distance = np.linalg.norm(near - point, axis=1)
-    return np.asarray(triangles[distance <= distance.min() + SAME_PLACE])
+    return np.asarray(np.linalg.norm(near - point, axis=1))
 
 
-def _facing(hand: Hand) -> Array:
-    """Return the cosine (k,) between each pad's normal and its motion, when half closed."""
-    # Motion of the pad points as the fingers close.
-    half, step = 0.5 * closed_positions(hand), 1e-4 * hand.closing_unit
-    motion = pad_points_at(hand, half + step) - pad_points_at(hand, half)
+def _mean_normal(finger: Finger, pad: Array, centre: Array) -> Array:
+    """Return the mean normal (3,) of a pad's triangles (n, 3, 3), out of its fingertip.
 
-    # Mean normal of each pad's surface, out of the fingertip. Without a region the pad is the whole
-    # closed surface, whose mean normal is zero, so that only the triangles at the pad point count.
-    X_GF, shapes = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand.model)
-    cosines = np.zeros(hand.num_fingers)
-    for i, pad in enumerate(pad_surfaces(hand.model, hand.fingers)):
-        corners = shapes[hand.fingers[i].fingertip]
-        if not len(pad) or not corners:
-            continue
-        if not hand.fingers[i].pad_region:
-            pad = _face_at(pad, hand.fingers[i].p_FiP)
-        normals, centre = _normals(pad), np.concatenate(corners).mean(axis=0)
-        inward = np.einsum("ij,ij->i", normals, pad.mean(axis=1) - centre) < 0.0
-        normals[inward] *= -1.0
-        normal = X_GF[i, :3, :3] @ normals.sum(axis=0)
-        length = np.linalg.norm(normal) * np.linalg.norm(motion[i])
-        cosines[i] = normal @ motion[i] / length if length > 0.0 else 0.0
-    return cosines
+    Without a region the pad is the whole closed surface, whose mean normal is zero. Then only the
+    triangles at the pad point count.
+    """
+    if not finger.pad_region:
+        distances = _distances(pad, finger.p_FiP)
+        pad = pad[distances <= distances.min() + SAME_PLACE]
+    normals = np.cross(pad[:, 1] - pad[:, 0], pad[:, 2] - pad[:, 0])
+    inward = np.einsum("ij,ij->i", normals, pad.mean(axis=1) - centre) < 0.0
+    normals[inward] *= -1.0
+    return np.asarray(normals.sum(axis=0))
 
 
 def check_meeting(hand: Hand) -> Finding:
@@ -395,10 +378,8 @@ def check_meeting(hand: Hand) -> Finding:
         return judge("fingertips", [fault + "the axes of the closing joints"], "")
 
     # Each pad must reach those opposite, and an object must fit between them.
-    text, short = (
-        f"{' and '.join(first)} against {' and '.join(second)}",
-        _shortfall(hand, opposition),
-    )
+    text = f"{' and '.join(first)} against {' and '.join(second)}"
+    short = _shortfall(hand, opposition)
     missing = {f.name: 1e3 * s for f, s in zip(hand.fingers, short, strict=True) if s > MEETING}
     if not missing and find_pinch(hand, WIDTH) is not None:
         return judge("fingertips", [], f"{text} meet")

@@ -307,7 +307,7 @@ class Pinch:
 def find_opposition(hand: Hand) -> Opposition:
     """Return the line along which the fingers close, from the motion of their pad points."""
     # Motion of each pad point across Gz, from the open hand to the limits.
-    paths = _pad_point_paths(hand)
+    paths = pad_points_at(hand, closing_path(hand, STEPS))
     motion = np.diff(paths, axis=0)[:, :, :2].reshape(-1, 2)
     (xx, xy), (_, yy) = multiply(motion.T, motion)
 
@@ -394,15 +394,8 @@ def closing_path(hand: Hand, steps: int) -> Array:
 
 
 def pad_points_at(hand: Hand, closing: Array) -> Array:
-    """Return the pad points (k, 3) in {G} at closing positions (k,) [m]."""
+    """Return the pad points (..., k, 3) in {G} [m] at closing positions (..., k) [rad or m]."""
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
-    points = [finger.p_FiP[None] for finger in hand.fingers]
-    return np.concatenate([transform_points(X, p) for X, p in zip(X_GF, points, strict=True)])
-
-
-def _pad_point_paths(hand: Hand) -> Array:
-    """Return the pad points (steps, k, 3) in {G} from the open hand to the limits [m]."""
-    X_GF = fingertip_poses(hand, spread=0.0, closing=closing_path(hand, STEPS))
     points = np.array([finger.p_FiP for finger in hand.fingers])
     return multiply(X_GF[..., :3, :3], points[:, :, None])[..., 0] + X_GF[..., :3, 3]
 

@@ -18,13 +18,12 @@ import re
 import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePath
 from xml.sax.saxutils import unescape
 
 from drakegrasp.config import CarriedHand, Config, HandSource
 from drakegrasp.errors import DataError, HandError
-from drakegrasp.foreign_files import parse_json
 from drakegrasp.hand.file_format import hand_file, hand_keys, validate_inside
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 
@@ -35,24 +34,28 @@ LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
 KEPT = 32
 #: Names of licence files next to a hand file or its model.
 _LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
-#: Suffixes of models and of files that a model may include.
-_MODELS = (".sdf", ".urdf", ".xml")
 #: References in a model: meshes and models in SDFormat, meshes in URDF, then textures.
 REFERENCES = re.compile(
     rb"<uri>\s*(?P<uri>.*?)\s*</uri>|<mesh\b[^>]*\bfilename\s*=\s*[\"'](?P<mesh>.*?)[\"']"
     rb"|<texture\b[^>]*\bfilename\s*=\s*[\"'](?P<texture>.*?)[\"']"
     rb"|<drake:diffuse_map>\s*(?P<map>.*?)\s*</drake:diffuse_map>"
 )
-#: References in Wavefront files: materials, and their textures at the end of a line.
-_MATERIALS = re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE)
-_TEXTURES = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|norm)[ \t](?:.*[ \t])?(\S+)[ \t\r]*$", re.M)
+#: References in files by their suffixes: models and what they include, materials of a Wavefront
+#: file, their textures at the end of a line, and parts of a glTF file.
+_NAMED = {
+    **dict.fromkeys((".sdf", ".urdf", ".xml"), REFERENCES),
+    ".obj": re.compile(rb"^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$", re.MULTILINE),
+    ".mtl": re.compile(
+        rb"^[ \t]*(?:map_\w+|bump|disp|norm)[ \t](?:.*[ \t])?(\S+)[ \t\r]*$", re.MULTILINE
+    ),
+    ".gltf": re.compile(rb'"uri"\s*:\s*"(?!data:)([^"]+)"'),
+}
 
 
 def hand_digest(source: HandSource) -> str:
     """Return a hash (16 hex digits) of a hand's files, see `HandFolder.digest`.
 
-    It differs between two hands of the same name. A missing file has the hash of an empty file;
-    `description.load_hand` rejects missing files.
+    It differs between two hands of the same name. `description.load_hand` rejects missing files.
 
     Raises:
         HandError: As `hand_folder`.
@@ -67,26 +70,22 @@ def hand_folder(source: HandSource) -> HandFolder:
         HandError: If there is no such hand, its files are too large, or it names a file outside its
             folder.
     """
-    path = hand_file(source)
-    key = path.absolute(), isinstance(source, CarriedHand)
-    known = _known.pop(key, None)
-    if known is None or known.stamp != file_stamp(known.asked):
-        known = _read_folder(*key)
-    while len(_known) >= KEPT:
-        _known.pop(next(iter(_known)))
-    _known[key] = known
-    return known
+    place = hand_file(source).absolute(), isinstance(source, CarriedHand)
+    found = _read_folder(*place)
+    if found.stamp != file_stamp(found.asked):
+        _read_folder.cache_clear()
+        found = _read_folder(*place)
+    return found
 
 
+@lru_cache(maxsize=KEPT)
 def _read_folder(path: Path, is_carried: bool) -> HandFolder:
     """Return the files of the hand of a hand file."""
     found = HandFolder(root=path.parent, name=path.name, is_carried=is_carried)
     found.add(path.name)
-    model, named = found.place_of(_model_of(path), ""), dict[str, str]()
-    found.add(model, named)
+    model = found.place_of(_model_of(path), "")
+    found.add(model)
     found.add_licences(path.stem.removesuffix("_hand"), model)
-    geometry = (named[reference] for reference in sorted(named))
-    found.counted = (path.name, model, *geometry, *found.parts)
     found.stamp = file_stamp(found.asked)
     return found
 
@@ -115,11 +114,9 @@ class HandFolder:
         root: The folder.
         name: Name of the hand file.
         is_carried: Whether it is the hand of a dataset, which a stranger may have written.
-        files: Paths of the files that exist, by place, the hand file first.
-        counted: Places of the files in the digest, in their order; some of the files may be
-            missing.
+        files: Paths of the files that exist, by place: the hand file, the model, what they name,
+            and licences.
         licences: Places of the licences.
-        parts: Places of the geometry that files other than the model name.
         asked: Paths of the named files, whether they exist or not.
         stamp: Sizes and times of these files.
         size: Total size of the files [byte].
@@ -129,9 +126,7 @@ class HandFolder:
     name: str
     is_carried: bool
     files: dict[str, Path] = field(default_factory=dict)
-    counted: tuple[str, ...] = ()
     licences: list[str] = field(default_factory=list)
-    parts: dict[str, str] = field(default_factory=dict)
     asked: dict[Path, bool] = field(default_factory=dict)
     stamp: tuple[int, ...] = ()
     size: int = 0
@@ -142,10 +137,11 @@ class HandFolder:
 
     @cached_property
     def digest(self) -> str:
-        """A hash (16 hex digits) of hand file, model and meshes, independent of paths."""
+        """A hash (16 hex digits) of all files but licences, independent of the folder."""
         digest = hashlib.sha256()
-        for place in self.counted:
-            digest.update(self.content(place))
+        for place in self.files:
+            if place not in self.licences:
+                digest.update(self.content(place))
         return digest.hexdigest()[:16]
 
     def place_of(self, reference: str, base: str) -> str:
@@ -193,24 +189,14 @@ class HandFolder:
             )
         return True
 
-    def add(self, place: str, named: dict[str, str] | None = None) -> None:
-        """Add a file and the files that it names, unless it is missing or already added.
-
-        Args:
-            place: Place of the file.
-            named: Receives the places of geometry by the references to it; `parts` if None.
-        """
+    def add(self, place: str) -> None:
+        """Add a file and the files that it names, unless it is missing or already added."""
         path = self.root / place
         if place in self.files or not self.has(path):
             return
         self.files[place] = path
-        for reference, is_geometry in _references(path):
-            inner = self.place_of(reference, posixpath.dirname(place))
-            if is_geometry and named is not None:
-                named[reference] = inner
-            elif is_geometry:
-                self.parts[inner] = inner
-            self.add(inner)
+        for reference in _references(path):
+            self.add(self.place_of(reference, posixpath.dirname(place)))
 
     def add_licences(self, hand: str, model: str) -> None:
         """Add the licences beside the hand file and the model."""
@@ -226,29 +212,13 @@ class HandFolder:
                     self.licences.append(place)
 
 
-def _references(path: Path) -> Iterator[tuple[str, bool]]:
-    """Yield each file that a model, a mesh or a material names, and whether it is geometry."""
-    suffix = path.suffix.lower()
-    if suffix in _MODELS:
-        for match in REFERENCES.finditer(path.read_bytes()):
-            kind = str(match.lastgroup)
-            reference = unescape(match[kind].decode(errors="surrogateescape"))
-            yield reference, kind in ("uri", "mesh")
-    elif suffix in (".obj", ".mtl"):
-        for name in (_MATERIALS if suffix == ".obj" else _TEXTURES).findall(path.read_bytes()):
-            yield name.decode(errors="surrogateescape"), False
-    elif suffix == ".gltf":
-        try:
-            tree = parse_json(path.read_bytes())
-            parts = [(part["uri"], key == "buffers") for key in ("buffers", "images")
-                     for part in tree.get(key, ()) if "uri" in part]  # fmt: skip
-        except (ValueError, TypeError, AttributeError):
-            return  # Drake rejects it
-        yield from ((str(uri), counts) for uri, counts in parts if not str(uri).startswith("data:"))
+def _references(path: Path) -> Iterator[str]:
+    """Yield each file that a model, a mesh or a material names."""
+    pattern = _NAMED.get(path.suffix.lower())
+    for match in pattern.finditer(path.read_bytes()) if pattern else ():
+        reference = match[match.lastindex or 0].decode(errors="surrogateescape")
+        yield unescape(reference) if pattern is REFERENCES else reference
 
-
-#: The files of hands, by hand file and whether a dataset carries it; the last used come last.
-_known: dict[tuple[Path, bool], HandFolder] = {}
 
 #: Folder of the hand's files in a dataset's directory.
 HAND_FOLDER = "hand"

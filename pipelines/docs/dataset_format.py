@@ -64,7 +64,7 @@ Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/`, `h
 
 `hand/` is copied when a build begins, and read by workers and by every later command. The files
 keep their places, below the folder of the hand file, and bytes. `versions` in the manifest contains
-a digest of hand file, model and meshes without their paths. A build continues with a hand of the
+a digest of these files, without licences and paths. A build continues with a hand of the
 same digest, wherever the hand is and whatever the name of its file; `merge` requires the same
 digest, and `check` compares it.
 """

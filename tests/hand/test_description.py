@@ -23,7 +23,6 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
-from drakegrasp.hand import folder
 from drakegrasp.hand.checks import overlap_query
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import MODELS, Coupling
@@ -246,24 +245,6 @@ def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
         trimesh.creation.box([0.02, edge, 0.09]).export(tmp_path / "bar.obj")
         shape = link_shapes(load_hand(path).model)["right"][0]
         assert np.ptp(shape, axis=0) == pytest.approx([0.02, edge, 0.09])
-
-
-def test_a_process_keeps_the_hands_that_it_used_last(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One that drafts many hands or loads many datasets does not grow with them."""
-    monkeypatch.setattr(folder, "KEPT", 2)
-    monkeypatch.setattr(folder, "_known", {})
-    paths = []
-    for name in "abc":
-        (tmp_path / name).mkdir()
-        paths.append(write_pincer(tmp_path / name))
-    one, other = folder.hand_folder(paths[0]), folder.hand_folder(paths[1])
-    assert folder.hand_folder(paths[0]) is one
-    folder.hand_folder(paths[2])
-    assert folder.hand_folder(paths[0]) is one
-    assert folder.hand_folder(paths[1]) is not other
-    assert len(folder._known) == 2
 
 
 def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:
