@@ -103,14 +103,14 @@ class Field:
     Attributes:
         name: Path below the group, which is a split, `/trials`, `/objects`, `/successes`, `/looks`
             or `/grasps`.
+        dtype: NumPy's name of the type, or "str" for UTF-8 text.
+        meaning: One sentence that describes the field.
         shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer or a
             letter: `k` fingers, `j` joints of the hand, `6k` length of a grasp (18 for three
             fingers), `S` size of an image [px]; in scenes.hdf5 `h` rows and `w` columns of an image
             [px], `o` objects of a scene.
-        dtype: NumPy's name of the type, or "str" for UTF-8 text.
         unit: SI unit, or "-".
         frame: Letter of the frame in which the field is expressed, or "-".
-        meaning: One sentence that describes the field.
         stage: First stage at which a row has a value; before it, floats are NaN and other types 0.
         per_finger: Whether NaN marks a finger that does not touch.
         sample: Whether the field is an image, stored in one chunk per row.
@@ -130,11 +130,11 @@ class Field:
     """
 
     name: str
-    shape: str
     dtype: str
-    unit: str
-    frame: str
     meaning: str
+    shape: str = ""
+    unit: str = "-"
+    frame: str = "-"
     stage: Stage = Stage.PLACED
     per_finger: bool = False
     sample: bool = False
@@ -254,7 +254,7 @@ def _copied(group: str, *fields: Field) -> tuple[Field, ...]:
 
 
 def _verdict(of: str, outcomes: list[Outcome]) -> Field:
-    return Field("outcome", "", "uint8", "-", "-", f"verdict: {_labels(outcomes)}", of=of)
+    return Field("outcome", "uint8", f"verdict: {_labels(outcomes)}", of=of)
 
 
 def _labels(members: Sequence[Outcome] | Sequence[Removal]) -> str:
@@ -279,23 +279,22 @@ def _friction_use(t: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[Any]:
 # One field on at most two lines makes this a table.
 # fmt: off
 
-_JOINTS = Field("q", "j", "float64", "rad or m", "-", "positions of the hand's joints", of="q")
+_JOINTS = Field("q", "float64", "positions of the hand's joints", "j", "rad or m", of="q")
 
 #: What `simulation.contacts.Contacts` measures at one instant, by its names.
 _CONTACTS: tuple[Field, ...] = (
-    Field("touching", "k", "bool", "-", "-", "whether the fingertip touches the object"),
-    Field("p_OQ", "k 3", "float64", "m", "O", "contact points", per_finger=True),
-    Field("nhat_Q_O", "k 3", "float64", "-", "O", "unit normals out of the object",
+    Field("touching", "bool", "whether the fingertip touches the object", "k"),
+    Field("p_OQ", "float64", "contact points", "k 3", "m", "O", per_finger=True),
+    Field("nhat_Q_O", "float64", "unit normals out of the object", "k 3", frame="O",
           per_finger=True),
-    Field("f_Q_O", "k 3", "float64", "N", "O", "forces of the fingertips on the object"),
-    Field("area", "k", "float64", "m^2", "-", "areas of the contact patches"),
-    Field("penetration", "k", "float64", "m", "-",
-          "largest penetration depths of the object's surface into the fingertips", limits=FROM_0),
-    Field("other_links", "", "uint8", "-", "-",
-          "number of other links of the hand that touch the object"),
-    Field("hand_on_table", "", "bool", "-", "-", "whether the hand touches the table"),
-    Field("object_on_table", "", "bool", "-", "-", "whether the object touches the table"),
-    Field("point_contacts", "", "uint16", "-", "-",
+    Field("f_Q_O", "float64", "forces of the fingertips on the object", "k 3", "N", "O"),
+    Field("area", "float64", "areas of the contact patches", "k", "m^2"),
+    Field("penetration", "float64", "largest penetration depths of the object's surface into "
+          "the fingertips", "k", "m", limits=FROM_0),
+    Field("other_links", "uint8", "number of other links of the hand that touch the object"),
+    Field("hand_on_table", "bool", "whether the hand touches the table"),
+    Field("object_on_table", "bool", "whether the object touches the table"),
+    Field("point_contacts", "uint16",
           "number of contacts of the object that were not hydroelastic"),
 )
 
@@ -310,71 +309,61 @@ _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 
 # Origin of a palm pose; an attempt's identity is object, candidate and stand-off.
 _LINEAGE = (
-    Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
-    Field("source", "", "uint8", "-", "-",
-          "sampler of the palm pose: 0 rotations, 1 normals, 5 closing, 3 other; 4 for a posture "
-          "from a file"),
+    Field("resting", "uint8", "index of the object's resting pose"),
+    Field("source", "uint8", "sampler of the palm pose: 0 rotations, 1 normals, 5 closing, 3 "
+          "other; 4 for a posture from a file"),
 )
 #: `preshape` of a posture without one, with which all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255
 # Fields of several tables.
 _PRESHAPE = (
-    Field("preshape", "", "uint8", "-", "-",
-          "index of the hand file's preshape; 255 for a posture without preshape; 0 if the hand "
-          "file has no preshapes",
-          optional=True),
-    Field("unused", "", "uint32", "-", "-",
-          "fingers that the preshape leaves out, as bits: 1 for the first finger. These fingers "
-          "have no contact", optional=True),
+    Field("preshape", "uint8", "index of the hand file's preshape; 255 for a posture without "
+          "preshape; 0 if the hand file has no preshapes", optional=True),
+    Field("unused", "uint32", "fingers that the preshape leaves out, as bits: 1 for the first "
+          "finger. These fingers have no contact", optional=True),
 )
-_SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints",
+_SPREAD = Field("spread", "float64", "angle of the spread joints", unit="rad",
                 shown=Shown("spread", "°"))
-_X_TO = Field("X_TO", "12", "float64", "m, -", "T", "resting pose of the object")
-_TIME_CLOSE = Field("time_close", "", "float64", "s", "-",
-                    "simulated time at which closing ended", of="trial.closed.duration",
-                    shown=Shown("time of closing", "s", 2))
-_TIME_LIFT = Field(
-    "time_lift", "", "float64", "s", "-",
-    "simulated time of the lift with its hold; shorter if the lift ended early",
-    of="trial.lift.duration", shown=Shown("time of the lift", "s", 2))
+_X_TO = Field("X_TO", "float64", "resting pose of the object", "12", "m, -", "T")
+_TIME_CLOSE = Field("time_close", "float64", "simulated time at which closing ended", unit="s",
+                    of="trial.closed.duration", shown=Shown("time of closing", "s", 2))
+_TIME_LIFT = Field("time_lift", "float64",
+                   "simulated time of the lift with its hold; shorter if the lift ended early",
+                   unit="s", of="trial.lift.duration", shown=Shown("time of the lift", "s", 2))
 #: Missing in files of datasets that do not measure it, see `close.scrape_depth`.
 _CLEARANCE = {
-    when: Field(f"clearance_{when}", "", "float64", "m", "T",
-                f"smallest height of the hand above the table's top {during}, negative below "
-                "the top; NaN in datasets that do not measure it", some=True, optional=True,
-                of=f"trial.{of}.clearance", shown=Shown(f"least height {during}", "mm"))
+    when: Field(f"clearance_{when}", "float64", f"smallest height of the hand above the table's "
+                f"top {during}, negative below the top; NaN in datasets that do not measure it",
+                unit="m", frame="T", some=True, optional=True, of=f"trial.{of}.clearance",
+                shown=Shown(f"least height {during}", "mm"))
     for when, of, during in (("close", "closed", "from the start of closing to its end"),
                              ("lift", "lift", "during the lift"))
 }
 _SLIP = _measured(
     "trial.lift",
-    Field("slip", "", "float64", "m", "G",
-          "distance that the object moved in the hand during the lift", limits=FROM_0,
-          shown=Shown("slip", "mm")),
-    Field("turn", "", "float64", "rad", "G",
-          "angle that the object turned in the hand during the lift", limits=ANGLE,
-          shown=Shown("turn", "°")),
+    Field("slip", "float64", "distance that the object moved in the hand during the lift",
+          unit="m", frame="G", limits=FROM_0, shown=Shown("slip", "mm")),
+    Field("turn", "float64", "angle that the object turned in the hand during the lift",
+          unit="rad", frame="G", limits=ANGLE, shown=Shown("turn", "°")),
 )
-_SLIP_USE = Field("slip_use", "k", "float64", "-", "-",
+_SLIP_USE = Field("slip_use", "float64",
                   "fraction of the friction cone in use after the lift; 1 at the border of the "
-                  "cone",
-                  stage=Stage.LIFTED, per_finger=True, some=True, optional=True,
+                  "cone", "k", stage=Stage.LIFTED, per_finger=True, some=True, optional=True,
                   derive=_friction_use, shown=Shown("friction in use", digits=2),
                   needs=("lifted_touching", "lifted_f_Q_O", "lifted_nhat_Q_O", "friction_hand"))
 _RELEASED = _measured(
     "trial.lift",
-    Field("slip_released", "", "float64", "m", "G",
-          "distance that the object moved in the hand before the wrist moved", limits=FROM_0,
-          shown=Shown("slip before the wrist moves", "mm")),
-    Field("turn_released", "", "float64", "rad", "G",
-          "angle that the object turned in the hand before the wrist moved", limits=ANGLE,
-          shown=Shown("turn before the wrist moves", "°")),
+    Field("slip_released", "float64",
+          "distance that the object moved in the hand before the wrist moved", unit="m",
+          frame="G", limits=FROM_0, shown=Shown("slip before the wrist moves", "mm")),
+    Field("turn_released", "float64",
+          "angle that the object turned in the hand before the wrist moved", unit="rad",
+          frame="G", limits=ANGLE, shown=Shown("turn before the wrist moves", "°")),
 )
 _WORDS = (
-    Field("precision", "", "bool", "-", "-",
-          "whether the attempt is a success in which only fingertips hold the object after the "
-          "lift"),
-    Field("stable", "", "bool", "-", "-",
+    Field("precision", "bool", "whether the attempt is a success in which only fingertips hold "
+          "the object after the lift"),
+    Field("stable", "bool",
           "whether the attempt is a precision grasp with slip below 5 mm and turn below 5 deg"),
 )
 
@@ -382,31 +371,27 @@ _WORDS = (
 CONDITION_FIELDS: tuple[Field, ...] = (
     *_measured(
         "conditions.materials",
-        Field("friction_hand", "", "float64", "-", "-",
-              "effective coefficient of friction between hand and object",
-              shown=Shown("friction of the object with the hand", digits=3)),
-        Field("friction_table", "", "float64", "-", "-",
-              "effective coefficient of friction between table and object",
-              shown=Shown("friction of the object with the table", digits=3)),
-        Field("mass", "", "float64", "kg", "-", "mass of the object; the inertia is scaled with it",
+        Field("friction_hand", "float64", "effective coefficient of friction between hand and "
+              "object", shown=Shown("friction of the object with the hand", digits=3)),
+        Field("friction_table", "float64", "effective coefficient of friction between table and "
+              "object", shown=Shown("friction of the object with the table", digits=3)),
+        Field("mass", "float64", "mass of the object; the inertia is scaled with it", unit="kg",
               shown=Shown("mass", "kg", 3)),
     ),
     *_measured(
         "conditions.appearance",
-        Field("object_colour", "3", "float64", "-", "-", "R, G, B of the object in 0..1"),
-        Field("table_colour", "3", "float64", "-", "-", "R, G, B of the table in 0..1"),
-        Field("light_direction", "3", "float64", "-", "W",
-              "unit vector along which the light from above shines"),
-        Field("light_strength", "", "float64", "-", "-", "intensity of the light from above"),
+        Field("object_colour", "float64", "R, G, B of the object in 0..1", "3"),
+        Field("table_colour", "float64", "R, G, B of the table in 0..1", "3"),
+        Field("light_direction", "float64", "unit vector along which the light from above shines",
+              "3", frame="W"),
+        Field("light_strength", "float64", "intensity of the light from above"),
     ),
-    Field("X_C0C", "12", "float64", "m, -", "C0",
-          "pose of the oto camera in its usual pose behind the palm", of="conditions.X_C0C"),
-    Field("depth_noise", "", "float64", "1/m", "-",
-          "standard deviation of a depth divided by the depth squared; 0 for images without noise",
-          of="conditions.sensor.noise"),
-    Field("depth_seed", "", "uint64", "-", "-",
-          "seed of the noise of the depth images; 0 for images without noise",
-          of="conditions.sensor.seed"),
+    Field("X_C0C", "float64", "pose of the oto camera in its usual pose behind the palm", "12",
+          "m, -", "C0", of="conditions.X_C0C"),
+    Field("depth_noise", "float64", "standard deviation of a depth divided by the depth "
+          "squared; 0 for images without noise", unit="1/m", of="conditions.sensor.noise"),
+    Field("depth_seed", "uint64", "seed of the noise of the depth images; 0 for images without "
+          "noise", of="conditions.sensor.seed"),
 )
 
 #: How often a sample survives noise; see `simulation.attempt.disturbed`. Missing in files of builds
@@ -414,98 +399,90 @@ CONDITION_FIELDS: tuple[Field, ...] = (
 ROBUST_FIELDS: tuple[Field, ...] = tuple(
     replace(field, stage=Stage.LIFTED, some=True, optional=True)
     for field in (
-        Field("robust_tried", "", "int32", "-", "-",
-              "number of disturbed repeats (section `robustness`) with a verdict; 0 for an attempt "
-              "that was not selected"),
-        Field("robust_kept", "", "int32", "-", "-",
-              "number of these that would be samples by the default filters, except those of "
-              "images and outliers"),
+        Field("robust_tried", "int32", "number of disturbed repeats (section `robustness`) with "
+              "a verdict; 0 for an attempt that was not selected"),
+        Field("robust_kept", "int32", "number of these that would be samples by the default "
+              "filters, except those of images and outliers"),
     )
 )
 
 #: A row per grasp, in `/train`, `/valid` and `/test` of both data files.
 DATA_FIELDS: tuple[Field, ...] = (
-    Field("images", "4 S S", "float32", "-, -, -, m", "C",
-          "R, G, B in 0..1 and depth; object and table only, never the hand", sample=True),
-    Field("masks", "S S", "uint8", "-", "C",
-          "1 where the object is visible, 0 elsewhere", sample=True, limits=(0, 1)),
-    Field("grasps", "6k", "float32", "m, -", "C",
-          "contact points, then outward unit normals, after closing, in the frame of this file's "
-          "camera"),
-    Field("grasps_held", "6k", "float32", "m, -", "C",
-          "contact points and normals after the lift, relative to the resting object"),
-    Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
+    Field("images", "float32", "R, G, B in 0..1 and depth; object and table only, never the hand",
+          "4 S S", "-, -, -, m", "C", sample=True),
+    Field("masks", "uint8", "1 where the object is visible, 0 elsewhere", "S S", frame="C",
+          sample=True, limits=(0, 1)),
+    Field("grasps", "float32", "contact points, then outward unit normals, after closing, in "
+          "the frame of this file's camera", "6k", "m, -", "C"),
+    Field("grasps_held", "float32", "contact points and normals after the lift, relative to the "
+          "resting object", "6k", "m, -", "C"),
+    Field("trial_id", "int64", "row of trials.hdf5"),
     *_copied("grasp_props", *_WORDS, *_LINEAGE, *_PRESHAPE),
     *_copied("grasp_props", *_SLIP, *_RELEASED, _SLIP_USE),
-    Field("grasp_props/other_links_held", "", "uint8", "-", "-",
-          "number of other links of the hand that touch the object after the lift",
-          of="lifted_other_links"),
-    Field("grasp_props/X_CG", "12", "float32", "m, -", "C",
-          "pose of the palm at the start and while closing, in the frame of this file's camera"),
-    Field("grasp_props/X_CG_held", "12", "float32", "m, -", "C",
-          "pose of the palm after the lift, relative to the resting object"),
-    Field("grasp_props/q", "j", "float32", "rad or m", "-",
-          "positions of the hand's joints after closing", of="closed_q"),
-    Field("grasp_props/q_held", "j", "float32", "rad or m", "-",
-          "positions of the hand's joints after the lift", of="lifted_q"),
-    Field("grasp_props/f_Q_C", "k 3", "float32", "N", "C",
-          "forces of the fingertips on the object after closing"),
-    Field("grasp_props/f_Q_C_held", "k 3", "float32", "N", "C",
-          "forces of the fingertips on the object after the lift, rotated with the object to its "
-          "resting pose"),
-    Field("grasp_props/area", "k", "float32", "m^2", "-",
-          "areas of the contact patches after closing", of="closed_area"),
-    Field("grasp_props/area_held", "k", "float32", "m^2", "-",
-          "areas of the contact patches after the lift", of="lifted_area"),
+    Field("grasp_props/other_links_held", "uint8", "number of other links of the hand that "
+          "touch the object after the lift", of="lifted_other_links"),
+    Field("grasp_props/X_CG", "float32", "pose of the palm at the start and while closing, in "
+          "the frame of this file's camera", "12", "m, -", "C"),
+    Field("grasp_props/X_CG_held", "float32",
+          "pose of the palm after the lift, relative to the resting object", "12", "m, -", "C"),
+    Field("grasp_props/q", "float32", "positions of the hand's joints after closing", "j",
+          "rad or m", of="closed_q"),
+    Field("grasp_props/q_held", "float32", "positions of the hand's joints after the lift", "j",
+          "rad or m", of="lifted_q"),
+    Field("grasp_props/f_Q_C", "float32", "forces of the fingertips on the object after closing",
+          "k 3", "N", "C"),
+    Field("grasp_props/f_Q_C_held", "float32", "forces of the fingertips on the object after "
+          "the lift, rotated with the object to its resting pose", "k 3", "N", "C"),
+    Field("grasp_props/area", "float32", "areas of the contact patches after closing", "k", "m^2",
+          of="closed_area"),
+    Field("grasp_props/area_held", "float32", "areas of the contact patches after the lift", "k",
+          "m^2", of="lifted_area"),
     *_copied("grasp_props", *ROBUST_FIELDS),
     # The mass is in object_props.
     *_copied("conditions", *(field for field in CONDITION_FIELDS if field.name != "mass")),
-    Field("object_props/object_name", "", "str", "-", "-", "name of the object"),
-    Field("object_props/class_name", "", "str", "-", "-", "name of the object's class"),
-    Field("object_props/work2com", "3", "float32", "m", "T",
-          "p_TOcm, centre of mass of the resting object"),
-    Field("object_props/work2inertia", "9", "float32", "kg m^2", "T",
-          "rotational inertia of the resting object about Ocm, 3x3 row-major"),
-    Field("object_props/work2mass", "1", "float32", "kg", "-",
-          "mass of the object, as in the trial", of="mass", limits=ABOVE_0),
-    Field("object_props/frame_cam2img_otm", "12", "float32", "m, -", "C (otm)",
-          "X_CI, image frame estimated from the otm mask"),
-    *(Field(f"object_props/frame_cam2work_{camera}", "12", "float32", "m, -", f"C ({camera})",
-            f"X_CT of the {camera} camera") for camera in reversed(CAMERAS)),
-    *(Field(f"object_props/frame_work2cam_{camera}", "12", "float32", "m, -", "T",
-            f"X_TC of the {camera} camera") for camera in reversed(CAMERAS)),
-    Field("object_props/frame_world2obj", "12", "float32", "m, -", "W", "X_WO, the resting object"),
-    Field("object_props/frame_world2work", "12", "float32", "m, -", "W", "X_WT, the table top"),
+    Field("object_props/object_name", "str", "name of the object"),
+    Field("object_props/class_name", "str", "name of the object's class"),
+    Field("object_props/work2com", "float32", "p_TOcm, centre of mass of the resting object", "3",
+          "m", "T"),
+    Field("object_props/work2inertia", "float32",
+          "rotational inertia of the resting object about Ocm, 3x3 row-major", "9", "kg m^2", "T"),
+    Field("object_props/work2mass", "float32", "mass of the object, as in the trial", "1", "kg",
+          of="mass", limits=ABOVE_0),
+    Field("object_props/frame_cam2img_otm", "float32",
+          "X_CI, image frame estimated from the otm mask", "12", "m, -", "C (otm)"),
+    *(Field(f"object_props/frame_cam2work_{camera}", "float32", f"X_CT of the {camera} camera",
+            "12", "m, -", f"C ({camera})") for camera in reversed(CAMERAS)),
+    *(Field(f"object_props/frame_work2cam_{camera}", "float32", f"X_TC of the {camera} camera",
+            "12", "m, -", "T") for camera in reversed(CAMERAS)),
+    Field("object_props/frame_world2obj", "float32", "X_WO, the resting object", "12", "m, -",
+          "W"),
+    Field("object_props/frame_world2work", "float32", "X_WT, the table top", "12", "m, -", "W"),
 )
 
 #: A row per attempt, whatever its outcome, in `/trials` of trials.hdf5 and of every shard.
 TRIAL_FIELDS: tuple[Field, ...] = (
-    Field("trial_id", "", "int64", "-", "-", "number of the row"),
-    Field("object", "", "int32", "-", "-", "row of /objects"),
+    Field("trial_id", "int64", "number of the row"),
+    Field("object", "int32", "row of /objects"),
     *_measured(
         "attempt",
-        Field("candidate", "", "int32", "-", "-",
-              "index of the palm pose among its object's candidates"),
-        Field("standoff_index", "", "uint8", "-", "-",
-              "index into the configuration's candidates.standoffs"),
+        Field("candidate", "int32", "index of the palm pose among its object's candidates"),
+        Field("standoff_index", "uint8", "index into the configuration's candidates.standoffs"),
         *_LINEAGE,
-        Field("posture_row", "", "float64", "-", "-",
-              "row of the posture in its file; NaN for a sampled palm pose", some=True,
-              optional=True),
-        Field("own_motors", "", "bool", "-", "-",
-              "whether each joint had its own motor, because the posture does not follow the "
-              "couplings of the hand file", optional=True),
+        Field("posture_row", "float64", "row of the posture in its file; NaN for a sampled palm "
+              "pose", some=True, optional=True),
+        Field("own_motors", "bool", "whether each joint had its own motor, because the posture "
+              "does not follow the couplings of the hand file", optional=True),
         *_PRESHAPE,
         _SPREAD,
-        Field("seed", "", "uint64", "-", "-",
+        Field("seed", "uint64",
               "state of the random stream of the candidate, from which the spread was drawn"),
     ),
     _verdict("trial.outcome", [outcome for outcome in Outcome if not outcome.verification_only]),
     *_measured(
         "trial",
         _X_TO,
-        Field("X_OG", "12", "float64", "m, -", "O",
-              "pose of the palm at the start; the candidate's pose if the palm ray misses"),
+        Field("X_OG", "float64", "pose of the palm at the start; the candidate's pose if the "
+              "palm ray misses", "12", "m, -", "O"),
     ),
     *CONDITION_FIELDS,
     *_since(
@@ -516,20 +493,19 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     ),
     *_since(
         Stage.LIFTED,
-        Field("surface_distance", "k", "float64", "m", "-",
-              "distance of the contact points after closing from the full mesh's surface",
-              per_finger=True, of="fit.distance", shown=Shown("off surface", "mm", 2)),
-        Field("normal_angle", "k", "float64", "rad", "-",
-              "angle between the normals after closing and the normal of the full mesh's nearest "
-              "face, or of the face nearest to a point ahead if it agrees better",
-              per_finger=True, of="fit.normal_angle",
-              shown=Shown("normal angle", "°")),
+        Field("surface_distance", "float64",
+              "distance of the contact points after closing from the full mesh's surface", "k",
+              "m", per_finger=True, of="fit.distance", shown=Shown("off surface", "mm", 2)),
+        Field("normal_angle", "float64",
+              "angle between the normals after closing and the normal of the full mesh's "
+              "nearest face, or of the face nearest to a point ahead if it agrees better", "k",
+              "rad", per_finger=True, of="fit.normal_angle", shown=Shown("normal angle", "°")),
         _TIME_LIFT,
         _CLEARANCE["lift"],
         *_LIFTED,
-        Field("X_TO_lifted", "12", "float64", "m, -", "T", "pose of the object after the lift",
+        Field("X_TO_lifted", "float64", "pose of the object after the lift", "12", "m, -", "T",
               of="trial.lift.X_TO"),
-        Field("X_OG_lifted", "12", "float64", "m, -", "O", "pose of the palm after the lift",
+        Field("X_OG_lifted", "float64", "pose of the palm after the lift", "12", "m, -", "O",
               of="trial.lift.X_OG"),
         *_SLIP,
         *_RELEASED,
@@ -543,137 +519,118 @@ TRIAL_FIELDS: tuple[Field, ...] = (
 def _image_fields(camera: str) -> tuple[Field, ...]:
     frame = f"C ({camera})"
     return (
-        Field(f"image_{camera}", "4 S S", "float32", "-, -, -, m", frame,
-              "R, G, B in 0..1 and depth", sample=True),
-        Field(f"mask_{camera}", "S S", "uint8", "-", frame, "1 where the object is visible",
+        Field(f"image_{camera}", "float32", "R, G, B in 0..1 and depth", "4 S S", "-, -, -, m",
+              frame, sample=True),
+        Field(f"mask_{camera}", "uint8", "1 where the object is visible", "S S", frame=frame,
               sample=True),
-        Field(f"X_TC_{camera}", "12", "float64", "m, -", "T", "pose of the camera"),
+        Field(f"X_TC_{camera}", "float64", "pose of the camera", "12", "m, -", "T"),
     )
 
 
 #: A row per success, in `/looks` of a shard.
 LOOK_FIELDS: tuple[Field, ...] = (
-    Field("row", "", "int32", "-", "-", "row of the shard's /trials"),
+    Field("row", "int32", "row of the shard's /trials"),
     *(field for camera in CAMERAS for field in _image_fields(camera)),
-    Field("X_CI_otm", "12", "float64", "m, -", "C (otm)",
-          "image frame estimated from the otm mask"),
+    Field("X_CI_otm", "float64", "image frame estimated from the otm mask", "12", "m, -",
+          "C (otm)"),
 )
 
 #: A row per success, in `/successes` of trials.hdf5.
 SUCCESS_FIELDS: tuple[Field, ...] = (
-    Field("trial_id", "", "int64", "-", "-", "row of /trials"),
-    Field("removal", "", "uint8", "-", "-",
-          f"why the success is not a sample: {_labels(list(Removal))}"),
+    Field("trial_id", "int64", "row of /trials"),
+    Field("removal", "uint8", f"why the success is not a sample: {_labels(list(Removal))}"),
 )
 
 #: A row per object, in `/objects` of trials.hdf5.
 OBJECT_FIELDS: tuple[Field, ...] = (
-    Field("name", "", "str", "-", "-", "name of the object"),
-    Field("class_name", "", "str", "-", "-", "name of the object's class"),
-    Field("mesh_sha256", "", "str", "-", "-",
-          "hash of the mesh file and of its entries in objects.yaml"),
-    Field("scale", "", "float64", "m", "-", "metres per unit of length of the mesh file"),
-    Field("up", "", "str", "-", "-", "axis of the mesh file that is +z of the object"),
-    Field("mass", "", "float64", "kg", "-", "mass"),
-    Field("density", "", "float64", "kg/m^3", "-", "mass divided by volume"),
-    Field("friction", "", "float64", "-", "-",
-          "the object's own coefficient with hand and table; NaN if those of the configuration "
-          "apply"),
-    Field("collision_error", "", "float64", "m", "-",
-          "largest distance between mesh and collision surface"),
-    Field("candidates", "", "int64", "-", "-", "number of palm poses"),
+    Field("name", "str", "name of the object"),
+    Field("class_name", "str", "name of the object's class"),
+    Field("mesh_sha256", "str", "hash of the mesh file and of its entries in objects.yaml"),
+    Field("scale", "float64", "metres per unit of length of the mesh file", unit="m"),
+    Field("up", "str", "axis of the mesh file that is +z of the object"),
+    Field("mass", "float64", "mass", unit="kg"),
+    Field("density", "float64", "mass divided by volume", unit="kg/m^3"),
+    Field("friction", "float64", "the object's own coefficient with hand and table; NaN if "
+          "those of the configuration apply"),
+    Field("collision_error", "float64", "largest distance between mesh and collision surface",
+          unit="m"),
+    Field("candidates", "int64", "number of palm poses"),
 )
 
 #: A row per predicted grasp, in the order of the input, in `/grasps` of the results of
 #: `drakegrasp verify`. Values of a stage that was not reached, or that a posture does not have, are
 #: NaN, 0, false or empty. Palm, joints, contacts and lift are those of the first wrist pose.
 VERIFICATION_FIELDS: tuple[Field, ...] = (
-    Field("object", "", "str", "-", "-", "name of the object", of="placed.model.name"),
+    Field("object", "str", "name of the object", of="placed.model.name"),
     _verdict("outcome", [outcome for outcome in Outcome if not outcome.dataset_only]),
-    Field("success", "", "bool", "-", "-",
-          "whether the first wrist pose holds, with each contact within verify.max_contact_error "
-          "of the requested contact", of="success"),
-    Field("held", "", "bool", "-", "-",
-          "whether the first wrist pose holds, wherever the contacts are", of="held"),
+    Field("success", "bool", "whether the first wrist pose holds, with each contact within "
+          "verify.max_contact_error of the requested contact", of="success"),
+    Field("held", "bool", "whether the first wrist pose holds, wherever the contacts are",
+          of="held"),
     *(replace(field, of=field.name) for field in _WORDS),
-    Field("sample", "", "bool", "-", "-",
-          "whether the grasp passes the filters of a dataset, except filters that need images or "
-          "other grasps", of="sample"),
-    Field("removal", "", "uint8", "-", "-",
-          f"first filter that removes a held grasp: {_labels(list(Removal))}",
+    Field("sample", "bool", "whether the grasp passes the filters of a dataset, except filters "
+          "that need images or other grasps", of="sample"),
+    Field("removal", "uint8", f"first filter that removes a held grasp: {_labels(list(Removal))}",
           stage=Stage.LIFTED, of="removal"),
-    Field("held_any", "", "bool", "-", "-",
-          "whether any of the tried wrist poses holds: the choice of an oracle",
-          of="held_any"),
-    Field("confidence", "", "float64", "-", "-",
-          "confidence that the file of the grasps states; NaN if it states none",
-          of="grasp.confidence",
-          shown=Shown("confidence", digits=3)),
-    Field("rank", "", "int64", "-", "-",
+    Field("held_any", "bool",
+          "whether any of the tried wrist poses holds: the choice of an oracle", of="held_any"),
+    Field("confidence", "float64", "confidence that the file of the grasps states; NaN if it "
+          "states none", of="grasp.confidence", shown=Shown("confidence", digits=3)),
+    Field("rank", "int64",
           "rank by confidence among the grasps for the same row, or without rows for the same "
           "object; 0 for the best, -1 if the file states no confidence", of="grasp.rank"),
-    Field("reason", "", "str", "-", "-", "reason of the outcome, in words", of="reason"),
-    Field("hints", "", "str", "-", "-",
-          "changes with which a failed grasp would fit much better, in words", of="hint_text"),
+    Field("reason", "str", "reason of the outcome, in words", of="reason"),
+    Field("hints", "str", "changes with which a failed grasp would fit much better, in words",
+          of="hint_text"),
     *_measured(
         "placed",
         _X_TO,
-        Field("X_TO_simulated", "12", "float64", "m, -", "T",
-              "pose of the object in the simulation: moved on the table and rotated about its "
-              "normal"),
+        Field("X_TO_simulated", "float64", "pose of the object in the simulation: moved on the "
+              "table and rotated about its normal", "12", "m, -", "T"),
     ),
-    Field("p_OQ", "k 3", "float64", "m", "O",
-          "contact points of the tried grasp; NaN in an invalid row", of="p_OQ"),
-    Field("nhat_Q_O", "k 3", "float64", "-", "O", "outward unit normals of the tried grasp",
+    Field("p_OQ", "float64", "contact points of the tried grasp; NaN in an invalid row", "k 3",
+          "m", "O", of="p_OQ"),
+    Field("nhat_Q_O", "float64", "outward unit normals of the tried grasp", "k 3", frame="O",
           of="nhat_Q_O"),
-    Field("normalised", "", "bool", "-", "-",
-          "whether a predicted normal was not of unit length", of="grasp.normalised"),
-    Field("surface_distance", "k", "float64", "m", "-",
-          "distance of the predicted points from the object's surface", of="surface_distance",
-          shown=Shown("requested to surface", "mm")),
-    Field("epsilon", "", "float64", "-", "-",
+    Field("normalised", "bool", "whether a predicted normal was not of unit length",
+          of="grasp.normalised"),
+    Field("surface_distance", "float64", "distance of the predicted points from the object's "
+          "surface", "k", "m", of="surface_distance", shown=Shown("requested to surface", "mm")),
+    Field("epsilon", "float64",
           "Ferrari-Canny measure of the predicted contacts, 0 without force closure",
-          of="epsilon",
-          shown=Shown("epsilon of the requested contacts", digits=3)),
+          of="epsilon", shown=Shown("epsilon of the requested contacts", digits=3)),
     *_measured(
         "pregrasp",
-        Field("X_OG", "12", "float64", "m, -", "O", "fitted or given pose of the palm"),
+        Field("X_OG", "float64", "fitted or given pose of the palm", "12", "m, -", "O"),
         _SPREAD,
     ),
-    Field("closing", "k", "float64", "rad or m", "-",
-          "closing positions at which the fingertips meet the predicted points",
-          of="fit.closing"),
-    Field("fit_residual", "k", "float64", "m", "-",
-          "distance of the predicted points from the fingertips at these positions",
-          of="fit.residual",
-          shown=Shown("requested to fingertip of the fit", "mm")),
-    Field("fit_normal_error", "k", "float64", "rad", "-",
-          "angle between the fingertips' and the predicted normals at these positions",
-          of="fit.normal_error",
-          shown=Shown("requested normal to pad of the fit", "°")),
-    Field("tries", "", "uint16", "-", "-", "number of wrist poses that were tried",
-          of="num_tries",
+    Field("closing", "float64", "closing positions at which the fingertips meet the predicted "
+          "points", "k", "rad or m", of="fit.closing"),
+    Field("fit_residual", "float64",
+          "distance of the predicted points from the fingertips at these positions", "k", "m",
+          of="fit.residual", shown=Shown("requested to fingertip of the fit", "mm")),
+    Field("fit_normal_error", "float64",
+          "angle between the fingertips' and the predicted normals at these positions", "k",
+          "rad", of="fit.normal_error", shown=Shown("requested normal to pad of the fit", "°")),
+    Field("tries", "uint16", "number of wrist poses that were tried", of="num_tries",
           shown=Shown("wrist poses tried", digits=0)),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
         *_CLOSED,
-        Field("contact_error", "k", "float64", "m", "-",
-              "distance of the contact points after closing from the requested ones; NaN for a "
-              "fingertip that does not touch", per_finger=True, of="contact_error",
-              shown=Shown("requested to reached", "mm")),
-        Field("normal_error", "k", "float64", "rad", "-",
-              "angle between the normals after closing and the requested ones", per_finger=True,
-              of="normal_error",
-              shown=Shown("requested to reached normal", "°")),
+        Field("contact_error", "float64", "distance of the contact points after closing from "
+              "the requested ones; NaN for a fingertip that does not touch", "k", "m",
+              per_finger=True, of="contact_error", shown=Shown("requested to reached", "mm")),
+        Field("normal_error", "float64",
+              "angle between the normals after closing and the requested ones", "k", "rad",
+              per_finger=True, of="normal_error", shown=Shown("requested to reached normal", "°")),
     ),
     *_since(
         Stage.LIFTED,
         _TIME_LIFT,
         *_LIFTED,
-        Field("X_TO_lifted", "12", "float64", "m, -", "T",
-              "pose of the object after the lift, which starts at X_TO_simulated",
-              of="trial.lift.X_TO"),
+        Field("X_TO_lifted", "float64", "pose of the object after the lift, which starts at "
+              "X_TO_simulated", "12", "m, -", "T", of="trial.lift.X_TO"),
         *_SLIP,
     ),
 )
@@ -688,34 +645,33 @@ DEPTH_UNIT = 1e-4
 #: A row per object and resting pose, in `/scenes` of scenes.hdf5. A scene is a list of `o` objects
 #: on the table; at present it has one object.
 SCENE_FIELDS: tuple[Field, ...] = (
-    Field("split", "", "uint8", "-", "-",
-          f"{', '.join(f'{i} {name}' for i, name in enumerate(SPLITS))}: by object, whatever "
-          "`split.by` is", limits=(0, len(SPLITS) - 1)),
-    Field("object", "o", "int32", "-", "-", "rows of /objects"),
-    Field("resting", "o", "uint8", "-", "-", "indices of the objects' resting poses"),
-    Field("probability", "o", "float64", "-", "-", "fractions of the drops that ended in them"),
-    Field("X_TO", "o 12", "float64", "m, -", "T",
-          "poses of the objects: resting poses, rotated about Tz and moved on the table"),
-    Field("mass", "o", "float64", "kg", "-",
-          "masses of the objects; the mass drawn for an attempt may differ"),
-    Field("friction_hand", "o", "float64", "-", "-",
-          "effective coefficients of friction between hand and objects; may differ in attempts"),
-    Field("friction_table", "o", "float64", "-", "-",
-          "effective coefficients of friction between table and objects; may differ in attempts"),
+    Field("split", "uint8", f"{', '.join(f'{i} {name}' for i, name in enumerate(SPLITS))}: by "
+          f"object, whatever `split.by` is", limits=(0, len(SPLITS) - 1)),
+    Field("object", "int32", "rows of /objects", "o"),
+    Field("resting", "uint8", "indices of the objects' resting poses", "o"),
+    Field("probability", "float64", "fractions of the drops that ended in them", "o"),
+    Field("X_TO", "float64", "poses of the objects: resting poses, rotated about Tz and moved "
+          "on the table", "o 12", "m, -", "T"),
+    Field("mass", "float64", "masses of the objects; the mass drawn for an attempt may differ",
+          "o", "kg"),
+    Field("friction_hand", "float64", "effective coefficients of friction between hand and "
+          "objects; may differ in attempts", "o"),
+    Field("friction_table", "float64", "effective coefficients of friction between table and "
+          "objects; may differ in attempts", "o"),
 )
 
 #: A row per camera and scene, in `/views` of scenes.hdf5.
 VIEW_FIELDS: tuple[Field, ...] = (
-    Field("scene", "", "int32", "-", "-", "row of /scenes"),
-    Field("kind", "", "uint8", "-", "-",
+    Field("scene", "int32", "row of /scenes"),
+    Field("kind", "uint8",
           f"the camera: {', '.join(f'{i} {name}' for i, name in enumerate(VIEW_KINDS))}"),
-    Field("rgb", "h w 3", "uint8", "-", "C", "colours", sample=True),
-    Field("depth", "h w", "uint16", "0.1 mm", "C",
-          "depth without noise; 0 where nothing is between `near` and `far`", sample=True),
-    Field("mask", "h w", "uint8", "-", "C",
-          "1 + index of the visible object in the scene, 0 elsewhere", sample=True),
-    Field("K", "9", "float64", "px", "-", "camera matrix, 3x3 row-major"),
-    Field("X_TC", "12", "float64", "m, -", "T", "pose of the camera"),
+    Field("rgb", "uint8", "colours", "h w 3", frame="C", sample=True),
+    Field("depth", "uint16", "depth without noise; 0 where nothing is between `near` and `far`",
+          "h w", "0.1 mm", "C", sample=True),
+    Field("mask", "uint8", "1 + index of the visible object in the scene, 0 elsewhere", "h w",
+          frame="C", sample=True),
+    Field("K", "float64", "camera matrix, 3x3 row-major", "9", "px"),
+    Field("X_TC", "float64", "pose of the camera", "12", "m, -", "T"),
     *(replace(field, optional=False) for field in CONDITION_FIELDS
       if field.name in ("object_colour", "table_colour", "light_direction", "light_strength",
                         "depth_noise", "depth_seed")),
@@ -723,21 +679,21 @@ VIEW_FIELDS: tuple[Field, ...] = (
 
 #: A row per closed hand, in `/grasps` of scenes.hdf5; the grasps of a scene are consecutive.
 SCENE_GRASP_FIELDS: tuple[Field, ...] = (
-    Field("scene", "", "int32", "-", "-", "row of /scenes"),
-    Field("object", "", "uint8", "-", "-", "index of the grasped object in the scene"),
-    Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
-    Field("outcome", "", "uint8", "-", "-", "verdict, see /trials"),
-    Field("tested", "", "bool", "-", "-",
+    Field("scene", "int32", "row of /scenes"),
+    Field("object", "uint8", "index of the grasped object in the scene"),
+    Field("trial_id", "int64", "row of trials.hdf5"),
+    Field("outcome", "uint8", "verdict, see /trials"),
+    Field("tested", "bool",
           "whether the hand was lifted to a verdict; if not, it is unknown whether it would hold"),
-    Field("held", "", "bool", "-", "-", "whether the grasp holds"),
+    Field("held", "bool", "whether the grasp holds"),
     *_WORDS,
-    Field("sample", "", "bool", "-", "-", "whether the grasp is a sample of the dataset"),
-    Field("source", "", "uint8", "-", "-", "sampler of the palm pose, see /trials", of="source"),
+    Field("sample", "bool", "whether the grasp is a sample of the dataset"),
+    Field("source", "uint8", "sampler of the palm pose, see /trials", of="source"),
     *(replace(field, of=field.name) for field in ROBUST_FIELDS),
     *_PRESHAPE,
-    Field("X_TG", "12", "float32", "m, -", "T", "pose of the palm at the start and while closing"),
-    Field("X_TG_held", "12", "float32", "m, -", "T",
-          "pose of the palm after the lift, relative to the resting object; NaN if not lifted"),
+    Field("X_TG", "float32", "pose of the palm at the start and while closing", "12", "m, -", "T"),
+    Field("X_TG_held", "float32", "pose of the palm after the lift, relative to the resting "
+          "object; NaN if not lifted", "12", "m, -", "T"),
     replace(_JOINTS, name="q_open", dtype="float32", of="",
             meaning="positions of the hand's joints where it starts to close, fully open"),
     replace(_JOINTS, dtype="float32", of="closed_q",
@@ -747,36 +703,35 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     *(field for suffix, when in (("", "after closing"), ("_held", "after the lift, on the resting "
                                                          "object; NaN if not lifted"))
       for field in (
-        Field(f"p_TQ{suffix}", "k 3", "float32", "m", "T", f"contact points {when}",
+        Field(f"p_TQ{suffix}", "float32", f"contact points {when}", "k 3", "m", "T",
               per_finger=True),
-        Field(f"nhat_Q_T{suffix}", "k 3", "float32", "-", "T",
-              f"unit normals out of the object {when}", per_finger=True),
-        Field(f"f_Q_T{suffix}", "k 3", "float32", "N", "T",
-              f"forces of the fingertips on the object {when}"),
+        Field(f"nhat_Q_T{suffix}", "float32", f"unit normals out of the object {when}", "k 3",
+              frame="T", per_finger=True),
+        Field(f"f_Q_T{suffix}", "float32", f"forces of the fingertips on the object {when}",
+              "k 3", "N", "T"),
     )),
 )
 
 #: A row per view and grasp of its scene, in `/visible` of scenes.hdf5, view by view.
 VISIBLE_FIELDS: tuple[Field, ...] = (
-    Field("view", "", "int32", "-", "-", "row of /views"),
-    Field("grasp", "", "int32", "-", "-", "row of /grasps"),
-    Field("visible", "k", "bool", "-", "-",
-          "whether the camera sees the contact after closing: the contact is in the image, and "
-          "neither object nor table hides it"),
+    Field("view", "int32", "row of /views"),
+    Field("grasp", "int32", "row of /grasps"),
+    Field("visible", "bool", "whether the camera sees the contact after closing: the contact is "
+          "in the image, and neither object nor table hides it", "k"),
 )
 
 #: A row per object, in `/objects` of scenes.hdf5.
 SCENE_OBJECT_FIELDS: tuple[Field, ...] = (
     *(field for field in OBJECT_FIELDS if field.name in ("name", "class_name", "mesh_sha256")),
-    Field("p_OS", f"{SURFACE_POINTS} 3", "float32", "m", "O",
-          "points spread evenly over the surface", sample=True),
-    Field("nhat_S_O", f"{SURFACE_POINTS} 3", "float32", "-", "O",
-          "unit normals out of the object at these points", sample=True),
+    Field("p_OS", "float32", "points spread evenly over the surface", f"{SURFACE_POINTS} 3", "m",
+          "O", sample=True),
+    Field("nhat_S_O", "float32", "unit normals out of the object at these points",
+          f"{SURFACE_POINTS} 3", frame="O", sample=True),
 )
 
 #: A row per predicted grasp, in `/rows` of the results for rows of a dataset.
 PREDICTED_ROW_FIELDS: tuple[Field, ...] = (
-    Field("row", "", "int64", "-", "-", "row of the dataset's split to which the grasp belongs"),
-    Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5 of the same sample"),
+    Field("row", "int64", "row of the dataset's split to which the grasp belongs"),
+    Field("trial_id", "int64", "row of trials.hdf5 of the same sample"),
 )
 # fmt: on

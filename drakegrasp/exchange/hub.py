@@ -60,7 +60,7 @@ COLUMNS: Columns = {
     if not field.sample
 }
 _OBJECTS = tuple(
-    Field(name, "o", "str", "-", "-", f"{what} of the objects")
+    Field(name, "str", f"{what} of the objects", "o")
     for name, what in (("object_name", "names"), ("class_name", "classes"))
 )
 _OF_SCENE = tuple(field for field in SCENE_FIELDS if field.name != "object")

@@ -55,7 +55,7 @@ SIZES = sizes(fingers=3, joints=4, image=8)
 def test_letters_of_a_shape_become_lengths(
     shape: str, axes: tuple[int | str, ...], row: tuple[int, ...]
 ) -> None:
-    field = Field("name", shape, "float64", "m", "O", "nothing")
+    field = Field("name", "float64", "nothing", shape, "m", "O")
     assert field.axes == axes
     assert field.row_shape(SIZES) == row
     values = field.empty(2, SIZES)

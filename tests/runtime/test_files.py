@@ -46,7 +46,7 @@ def test_values_are_not_read_from_where_others_lie(tmp_path: Path) -> None:
     path = tmp_path / "file.h5"
     with atomic_hdf5(path) as file:
         for number, name in enumerate(("mine", "other")):
-            field = Field(name, "", "float32", "-", "-", "a column")
+            field = Field(name, "float32", "a column")
             write_field(file, field, np.full(5, number, dtype=np.float32))
     with h5py.File(path) as file:
         mine, other = (
