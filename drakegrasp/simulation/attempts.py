@@ -26,14 +26,13 @@ from drakegrasp.frames import (
     Array,
     as_numbers,
     frame_in_object,
-    make_pose,
     validate_frame,
 )
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
-from drakegrasp.simulation.candidates import Candidates
+from drakegrasp.simulation.candidates import Candidates, make_poses
 from drakegrasp.simulation.posture import (
     BESIDE_GRASP,
     Posture,
@@ -176,12 +175,9 @@ class Attempts(GraspRows):
         Raises:
             GraspError: If the frame is "mesh" and its pose is not given.
         """
-        X_OG = multiply(self.frame_pose(i, X_TO, X_OM), self.X_FG[i])
-        return _posture(self, i, X_OG)
-
-    def frame_pose(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
-        """Return the pose (4, 4) in {O} of the frame of a row; see `posture`."""
-        return frame_in_object(self.frame, X_TO, X_OM, None if self.X_TC is None else self.X_TC[i])
+        X_TC = None if self.X_TC is None else self.X_TC[i]
+        X_OF = frame_in_object(self.frame, X_TO, X_OM, X_TC)
+        return _posture(self, i, multiply(X_OF, self.X_FG[i]))
 
     def names_pose(self, i: int) -> bool:
         """Return whether a row names its resting pose."""
@@ -316,32 +312,35 @@ def make_attempts(
             not belong to the hand.
         HandError: If the hand has no such link.
     """
-    # What all rows share: preshapes and joints of the hand, the palm's frame, the table's frame.
-    count = len(objects)
-    palms = np.broadcast_to(np.asarray(q_grasp is None or alone, dtype=bool), (count,))
-    names = tuple(name or "" for name in preshape or [""] * count)
-    no_preshape, kept = _known_preshapes(names, palms, hand)
-    given = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
-    order = list(joint_order(hand) if joints is None else joints)
-    q = _in_order(hand, count, order, {k: v for k, v in given.items() if v is not None}, kept)
-    X_AG = hand.palm_in(link or "")
-    _validate_table(count, frame, X_TC)
+    count, size = len(objects), (len(objects), len(hand.joint_names))
+    if not count:
+        raise GraspError("postures must be at least one row, got none")
+    validate_frame(frame)
+    if (X_TC is None) == (frame == "camera"):
+        raise GraspError("X_TC must be given with the frame camera, and only then")
 
-    # Columns that every row must have and columns that a row may lack; `bad` has a row's fault.
+    # What each row has or may lack; `bad` gets a row's first fault.
     bad = [""] * count if invalid is None else list(invalid)
+    palms = np.broadcast_to(np.asarray(q_grasp is None or alone, dtype=bool), (count,))
     stands = _resting(resting, count, bad)
     under = _conditions(conditions, count, bad)
-    bad = [one or other for one, other in zip(bad, no_preshape, strict=True)]
-    size = (count, len(hand.joint_names))
-    pregrasp, squeeze = _beside_grasp(q, palms, size, bad)
+    names, kept = _preshapes(preshape, palms, hand, bad)
+
+    # The joints in the plant's order, and the pose of the palm frame.
+    stages = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
+    q = _in_order(hand, list(joint_order(hand) if joints is None else joints), stages, kept)
     if link is not None:
-        X_FG = multiply(np.asarray(X_FG), X_AG)
+        X_FG = multiply(np.asarray(X_FG), hand.palm_in(link))
+    for stage in ("q_pregrasp", "q_squeeze"):
+        q[stage] = _numbers(q[stage], size, stage, bad, some=True)
+        for i in np.flatnonzero(palms & ~np.isnan(q[stage]).all(axis=1)):
+            bad[i] = bad[i] or f"{stage} must be {BESIDE_GRASP}"
     return Attempts(
         objects=tuple(objects),
         X_FG=_poses(X_FG, count, "the palm's pose", bad),
-        q_grasp=_numbers(q.get("q_grasp"), size, "q_grasp", bad, some=palms),
-        q_pregrasp=pregrasp,
-        q_squeeze=squeeze,
+        q_grasp=_numbers(q["q_grasp"], size, "q_grasp", bad, some=palms),
+        q_pregrasp=q["q_pregrasp"],
+        q_squeeze=q["q_squeeze"],
         frame=frame,
         X_TC=None if X_TC is None else _poses(X_TC, count, "X_TC", bad),
         scale=_numbers(scale, (count,), "scale", bad, some=True),
@@ -424,14 +423,6 @@ def read_confidence(stated: Any, shape: tuple[int, ...], invalid: Sequence[str] 
     return confidence
 
 
-def _validate_table(count: int, frame: str, X_TC: npt.ArrayLike | None) -> None:
-    if not count:
-        raise GraspError("postures must be at least one row, got none")
-    validate_frame(frame)
-    if (X_TC is None) == (frame == "camera"):
-        raise GraspError("X_TC must be given with the frame camera, and only then")
-
-
 def _resting(told: npt.ArrayLike | None, count: int, bad: list[str]) -> npt.NDArray[np.int64]:
     """Return indices (n,) of resting poses, `UNTOLD` for NaN."""
     where = _numbers(told, (count,), "resting", bad, some=True)
@@ -447,19 +438,6 @@ def _conditions(told: npt.ArrayLike | None, count: int, bad: list[str]) -> Array
     for i, k in np.argwhere(known <= 0.0):
         bad[i] = bad[i] or f"{CONDITIONS[k]} must be positive, got {known[i, k]:g}"
     return known
-
-
-def _beside_grasp(
-    q: Mapping[str, Array], palms: npt.NDArray[np.bool_], size: tuple[int, int], bad: list[str]
-) -> tuple[Array, Array]:
-    """Return pregrasp and squeeze (n, j) [rad or m]; a palm pose alone (n,) must have neither."""
-    pregrasp, squeeze = (
-        _numbers(q.get(name), size, name, bad, some=True) for name in ("q_pregrasp", "q_squeeze")
-    )
-    for name, stage in (("q_pregrasp", pregrasp), ("q_squeeze", squeeze)):
-        for i in np.flatnonzero(palms & ~np.isnan(stage).all(axis=1)):
-            bad[i] = bad[i] or f"{name} must be {BESIDE_GRASP}"
-    return pregrasp, squeeze
 
 
 def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
@@ -498,13 +476,9 @@ def join_rows(tables: Sequence[Rows]) -> Rows:
 
 
 def _in_order(
-    hand: Hand,
-    count: int,
-    joints: list[str],
-    given: Mapping[str, Any],
-    kept: Sequence[Mapping[str, float] | None],
+    hand: Hand, joints: list[str], stages: Mapping[str, Any], kept: Sequence[Mapping[str, float]]
 ) -> dict[str, Array]:
-    """Return joint positions (n, j) in the plant's order, by their stage.
+    """Return the joint positions (n, j) of each stage in the plant's order; NaN if not given.
 
     For each row, `kept` has the positions of the joints that its preshape keeps.
     """
@@ -518,44 +492,41 @@ def _in_order(
         raise GraspError("joints must be named once each, got one twice")
 
     # Joints that the hand file moves or keeps may be left out.
-    followers = {
-        c.joint: (hand.fingers[i].closing_joint, c.ratio, c.offset)
+    leaders = {
+        c.joint: (hand.fingers[i].closing_joint, c)
         for i in hand.motor_fingers
         for c in hand.followers(i)
     }
-    still = set(order).intersection(*(each for each in kept if each is not None))
-    known = {*joints, *still, *followers}
-    if missing := [name for name in order if name not in known]:
+    still = set(order).intersection(*kept)
+    if missing := [name for name in order if name not in {*joints, *leaders, *still}]:
         raise GraspError(f"joints must include {listed(missing)}, got {listed(joints)}")
-    found = {}
+    found = dict[str, Array]()
     turning = [hand.joint_units[name] == "rad" for name in joints]
-    for stage, values in given.items():
-        rows = _joint_rows(values, (count, len(joints)), stage.removeprefix("q_"), turning)
+    for stage, values in stages.items():
+        if values is None:
+            found[stage] = np.full((len(kept), len(order)), np.nan)
+            continue
+        rows = _array(values, (len(kept), len(joints)), f"{stage.removeprefix('q_')} joints")
+        _validate_radians(rows[:, turning], stage.removeprefix("q_"))
         columns = dict(zip(joints, rows.T, strict=True))
-        there = ~np.isnan(rows[:, 0])
         for name in still - columns.keys():
-            held = [np.nan if each is None else each[name] for each in kept]
-            columns[name] = np.where(there, held, np.nan)
-        for name, (leader, ratio, offset) in followers.items():
+            columns[name] = np.where(np.isnan(rows[:, 0]), np.nan, [row[name] for row in kept])
+        for name, (leader, coupling) in leaders.items():
             if name not in columns:
-                columns[name] = ratio * columns[leader] + offset
+                columns[name] = coupling.ratio * columns[leader] + coupling.offset
         found[stage] = np.column_stack([columns[name] for name in order])
     return found
 
 
-def _joint_rows(values: Any, shape: tuple[int, int], stage: str, turning: list[bool]) -> Array:
-    """Return joint positions as numbers (n, m); revolute joints must be in radians."""
-    rows = _array(values, shape, f"{stage} joints")
-
-    # If the numbers were degrees, most rows would have a joint beyond a whole turn.
-    angles = rows[:, turning]
+def _validate_radians(angles: Array, stage: str) -> None:
+    """Reject angles (n, m) of revolute joints that look like degrees."""
+    # Most rows would have a joint beyond a whole turn.
     largest = np.abs(angles[np.isfinite(angles).all(axis=1)]).max(axis=1, initial=0.0)
     if len(largest) and np.median(largest) > 2.0 * np.pi:
         raise GraspError(
             f"{stage} joints must be in radians, got up to {largest.max():.4g}: these look like "
             "degrees"
         )
-    return rows
 
 
 def _array(values: Any, shape: tuple[int, ...], name: str) -> Array:
@@ -591,30 +562,26 @@ def _numbers(
     return np.ascontiguousarray(array)
 
 
-def _known_preshapes(
-    names: Sequence[str], palms: npt.NDArray[np.bool_], hand: Hand
-) -> tuple[list[str], list[Mapping[str, float] | None]]:
-    """Return for each row why the hand lacks its preshape, and the joints that the preshape keeps.
+def _preshapes(
+    named: Sequence[str | None] | None, palms: npt.NDArray[np.bool_], hand: Hand, bad: list[str]
+) -> tuple[tuple[str, ...], list[Mapping[str, float]]]:
+    """Return the names (n,) of preshapes, and the positions of the joints that each keeps.
 
-    The mask `palms` (n,) selects rows with a palm pose alone.
-
-    Raises:
-        GraspError: If `names` has another number of rows.
+    The mask `palms` (n,) selects rows with a palm pose alone. `bad` gets the reason for each row
+    whose preshape the hand lacks.
     """
-    count = len(palms)
-    if len(names) != count:
-        raise GraspError(f"preshape must be of {count} rows, got {len(names)}")
-    reasons, kept = [""] * count, list[Mapping[str, float] | None]()
+    names = tuple(name or "" for name in named or [""] * len(palms))
+    if len(names) != len(palms):
+        raise GraspError(f"preshape must be of {len(palms)} rows, got {len(names)}")
+    # A row without joints, or whose preshape does not exist, keeps none that has to be known.
+    kept: list[Mapping[str, float]] = [dict.fromkeys(joint_order(hand), np.nan)] * len(names)
     for i, name in enumerate(names):
-        if name == EACH and palms[i] and hand.preshapes:
-            kept.append(None)
-            continue
-        try:
-            kept.append(hand.at(preshape_index(hand, name or None)).preshape)
-        except GraspError as error:
-            reasons[i] = str(error)
-            kept.append(None)
-    return reasons, kept
+        if not (name == EACH and palms[i] and hand.preshapes):
+            try:
+                kept[i] = hand.at(preshape_index(hand, name or None)).preshape
+            except GraspError as error:
+                bad[i] = bad[i] or str(error)
+    return names, kept
 
 
 def quaternion_poses(
@@ -638,20 +605,19 @@ def quaternion_poses(
             f"got {p.shape} and {wxyz.shape}"
         )
     length = np.linalg.norm(wxyz, axis=1)
-    bad = ~np.isfinite(p).all(axis=1) | ~(np.abs(length - 1.0) <= UNIT_TOLERANCE)
+    good = np.isfinite(p).all(axis=1) & (np.abs(length - 1.0) <= UNIT_TOLERANCE)
     reasons = [
-        "position and quaternion must be finite, and the quaternion of length 1, got "
+        ""
+        if is_good
+        else "position and quaternion must be finite, and the quaternion of length 1, got "
         f"{p[i].tolist()} and {wxyz[i].tolist()}"
-        if none
-        else ""
-        for i, none in enumerate(bad.tolist())
+        for i, is_good in enumerate(good.tolist())
     ]
     # In single precision, the length of a quaternion is off by about 1e-7.
     X = np.full((len(p), 4, 4), np.nan)
-    good = np.flatnonzero(~bad)
-    if good.size:
+    if good.any():
         R = Rotation.from_quat(wxyz[good] / length[good, None], scalar_first=True).as_matrix()
-        X[good] = [make_pose(*each) for each in zip(R, p[good], strict=True)]
+        X[good] = make_poses(R, p[good])
     return X, reasons
 
 
@@ -690,20 +656,17 @@ def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]
     must = f"0 to {len(poses) - 1}" if len(poses) > 1 else "0, the only one"
     found = [""] * len(table)
     for i, each in enumerate(table.objects):
-        if each != name:
+        if each != name or table.invalid[i]:
             continue
-        if table.invalid[i]:
-            continue
+        given, stated = np.isfinite(table.X_TO[i]).all(), table.scale[i]
         if not table.stands(i, poses):
-            told = np.isfinite(table.X_TO[i]).all()
             found[i] = (
                 f"resting pose of {name} must be {must} (objects.resting_poses drops more), "
-                f"got {'another X_TO' if told else table.resting[i]}"
+                f"got {'another X_TO' if given else table.resting[i]}"
             )
-        elif np.isfinite(table.scale[i]) and not np.isclose(table.scale[i], scale, rtol=1e-3):
+        elif np.isfinite(stated) and not np.isclose(stated, scale, rtol=1e-3):
             found[i] = (
-                f"scale must be that of {name}, {scale:g} (objects.yaml states it), "
-                f"got {table.scale[i]:g}"
+                f"scale must be that of {name}, {scale:g} (objects.yaml states it), got {stated:g}"
             )
     return found
 
