@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
     from drakegrasp.simulation.attempts import make_posture
-    from drakegrasp.simulation.placement import PlacedObject, place_object
-    from drakegrasp.simulation.posture import Posture, run_trial
+    from drakegrasp.simulation.placement import PlacedObject, place_object, run_trial
+    from drakegrasp.simulation.posture import Posture
     from drakegrasp.verification.result import PoseTrial, Verification
     from drakegrasp.vision.depth_image import cloud_from_depth, fit_table
 
@@ -91,7 +91,7 @@ _HOMES = {
     "propose": "scoring.predicting",
     "rank": "scoring.ranking",
     "replay_trial": "generation.replay",
-    "run_trial": "simulation.posture",
+    "run_trial": "simulation.placement",
     "score": "api.scoring",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",

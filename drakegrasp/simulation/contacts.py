@@ -120,11 +120,6 @@ def forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
     return forces
 
 
-def open_hand_collides(scene: Scene) -> bool:
-    """Return whether a part of the hand intersects object or table, or is inside the object."""
-    return bool(_meetings_of_hand(scene)) or is_inside(scene, _points_in_parts(scene))
-
-
 def open_hand_meets(scene: Scene) -> dict[str, list[str]]:
     """Return the links of the hand that intersect the object and the table, under these keys.
 
@@ -132,34 +127,26 @@ def open_hand_meets(scene: Scene) -> dict[str, list[str]]:
     intersect. A part that is completely inside the object has no contact surface, so a point inside
     each part is also tested against the object's volume.
     """
-    names = {scene.object.index(): "object", scene.table.index(): "table"}
-    found: dict[str, set[str]] = {name: set() for name in names.values()}
-    hand, plant = hand_bodies(scene), scene.plant
-    for bodies in _meetings_of_hand(scene):
-        for other in bodies - hand:
-            found[names[other]] |= {plant.get_body(body).name() for body in bodies & hand}
-    for (geometry, _), point in zip(scene.parts, _points_in_parts(scene), strict=True):
-        if is_inside(scene, point[None]):
-            found["object"].add(plant.get_body(_body_of(scene, geometry)).name())
-    return {name: sorted(links) for name, links in found.items() if links}
-
-
-def _meetings_of_hand(scene: Scene) -> list[set[BodyIndex]]:
-    """Return the pairs of a link of the hand and another body that intersect."""
-    query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
+    plant, hand = scene.plant, hand_bodies(scene)
+    query = plant.get_geometry_query_input_port().Eval(scene.context)
     surfaces, pairs = query.ComputeContactSurfacesWithFallback(
         HydroelasticContactRepresentation.kPolygon
     )
     meetings = [{_body_of(scene, s.id_M()), _body_of(scene, s.id_N())} for s in surfaces]
     meetings += [{_body_of(scene, p.id_A), _body_of(scene, p.id_B)} for p in pairs]
-    hand = hand_bodies(scene)
-    return [bodies for bodies in meetings if bodies & hand and not bodies <= hand]
+    meetings += [
+        {_body_of(scene, geometry), scene.object.index()}
+        for geometry, p in scene.parts
+        if is_inside(scene, (query.GetPoseInWorld(geometry) @ p)[None])
+    ]
 
-
-def _points_in_parts(scene: Scene) -> Array:
-    """Return one point (n, 3) inside each part of the hand, in {W}."""
-    query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
-    return np.array([query.GetPoseInWorld(geometry) @ p for geometry, p in scene.parts])
+    # Neither fingers that meet each other count, nor the object on the table.
+    found: dict[str, list[str]] = {}
+    for name, body in (("object", scene.object), ("table", scene.table)):
+        links = set[BodyIndex]().union(*(pair for pair in meetings if body.index() in pair)) & hand
+        if links:
+            found[name] = sorted(plant.get_body(link).name() for link in links)
+    return found
 
 
 def is_inside(scene: ObjectScene, p_WP: Array) -> bool:

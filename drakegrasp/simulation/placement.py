@@ -1,4 +1,4 @@
-"""An object at rest on the table, against which grasps are verified.
+"""An object at rest on the table, against which grasps are verified, and the trial of a posture.
 
 Input: a mesh file, a trimesh or a prepared object. Output: the object and its resting pose.
 Verification simulates at `canonical_pose`, so that no verdict depends on where the object stands on
@@ -17,15 +17,20 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config
+from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import ConfigError, GraspError, MeshError
 from drakegrasp.frames import Array, make_pose, read_pose, transform_points
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.mesh.loading import clean_triangles
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import UNITS, find_mesh, validate_units
 from drakegrasp.runtime.environment import one_thread
+from drakegrasp.simulation.attempts import make_posture
+from drakegrasp.simulation.posture import Posture, start_of
+from drakegrasp.simulation.scene_cache import run_cached
 from drakegrasp.simulation.settle import settle
+from drakegrasp.simulation.trial import TrialRecord
 
 #: Largest distance of the object's lowest point from the table at a given pose [m].
 MAX_GAP = 0.005
@@ -125,6 +130,39 @@ def place_object(
         known = _standing(model, read_pose(X_TO, "X_TO"))
     X_TO = settle(model, config).X_TO if known is None else known
     return PlacedObject(model=model, X_TO=X_TO, config=config)
+
+
+@one_thread
+def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = None) -> TrialRecord:
+    """Close a simulated hand by a posture, lift the object, and return what happened.
+
+    The object is simulated at `PlacedObject.X_TO_simulated`. If the closed hand may lift, it always
+    lifts until it is certain whether it holds, regardless of the section `lift`. Contacts are those
+    of the fingers of the posture's preshape.
+
+    Args:
+        placed: The object on the table, see `place_object`.
+        posture: Wrist and joints, see `simulation.attempts.make_posture`.
+        config: Hand, physics and lift; None for the configuration of the placed object.
+
+    Raises:
+        GraspError: If the posture does not fit the hand, or `placed` is not a placed object.
+        ConfigError: If the object was placed with other values, or the hand cannot have the drive.
+        HandError: If the hand cannot be used.
+    """
+    if not isinstance(placed, PlacedObject):
+        raise GraspError(f"placed must be of place_object, got a {type(placed).__name__}")
+    if not isinstance(posture, Posture):
+        raise GraspError(f"posture must be a Posture, got a {type(posture).__name__}")
+    config = with_whole_lifts(config_for(placed, config))
+    validate_same_objects(config, placed.config, "as the object was placed with")
+    hand, q = (
+        load_hand(config.hand_source),
+        (posture.q_grasp, posture.q_pregrasp, posture.q_squeeze),
+    )
+    checked = make_posture(hand, posture.X_OG, *q, preshape=posture.preshape)
+    start = start_of(checked, hand)
+    return run_cached(placed.model, placed.X_TO_simulated, start, config)
 
 
 def config_for(mesh: object, config: Config | None) -> Config:

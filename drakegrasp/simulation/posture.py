@@ -1,10 +1,9 @@
-"""Postures: a wrist pose with or without the positions of all joints, and the trial of a posture.
+"""Postures: a wrist pose with or without the positions of all joints, and the attempt at it.
 
-Input: what a network or another tool states about a grasp. Output: a `Posture`, checked and in {O};
-the `Attempt` of its trial; and its trial on an object. If a wrist pose has no joints, the open hand
-closes, as in an attempt of a sampler. If the joints follow the couplings of the hand file, the
-hand's own motors close the hand, as in every attempt. Otherwise each joint has its own motor, which
-moves from the pregrasp to the grasp and on to the squeeze.
+Input: a `Posture`, checked and in {O}. Output: the `Attempt` of its trial. If a wrist pose has no
+joints, the open hand closes, as in an attempt of a sampler. If the joints follow the couplings of
+the hand file, the hand's own motors close the hand, as in every attempt. Otherwise each joint has
+its own motor, which moves from the pregrasp to the grasp and on to the squeeze.
 """
 
 from __future__ import annotations
@@ -14,17 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import Array, read_pose
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, open_together
 from drakegrasp.hand.parsing import position_order
-from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.placement import PlacedObject, config_for, validate_same_objects
-from drakegrasp.simulation.scene_cache import run_cached
-from drakegrasp.simulation.trial import TrialRecord
 
 #: A joint follows the hand file if it is at most this far from where the file has it (coupled
 #: joint) or from another spread joint, in units of its finger's closing joint.
@@ -95,27 +89,6 @@ def exact_pose(X: npt.ArrayLike, name: str) -> Array:
 def joint_order(hand: Hand) -> tuple[str, ...]:
     """Return the names of a hand's joints in the plant's order, that of the stored `closed_q`."""
     return position_order(hand.model, hand.palm_link)
-
-
-def validate_posture(posture: Posture, hand: Hand) -> None:
-    """Reject a posture that is not one of a hand.
-
-    Raises:
-        GraspError: If the pose or a vector is invalid, or a pregrasp or a squeeze is given alone.
-    """
-    exact_pose(posture.X_OG, "the palm's pose")
-    size = len(hand.joint_names)
-    for name in ("q_grasp", "q_pregrasp", "q_squeeze"):
-        q = getattr(posture, name)
-        if q is None:
-            continue
-        if posture.q_grasp is None:
-            raise GraspError(f"{name} must be {BESIDE_GRASP}")
-        if np.shape(q) != (size,) or not np.isfinite(q).all():
-            raise GraspError(f"{name} must be {size} finite joint positions, got others")
-
-
-# The trial of a posture
 
 
 def start_of(posture: Posture, hand: Hand) -> Attempt:
@@ -220,33 +193,3 @@ def squeezed(start: Array, grasp: Array, hand: Hand) -> Array:
     units = np.where(slides, 0.1, 1.0)
     most = float((np.abs(grasp - start) / units).max())
     return grasp if most == 0.0 else grasp + (grasp - start) * (SQUEEZED / most)
-
-
-@one_thread
-def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = None) -> TrialRecord:
-    """Close a simulated hand by a posture, lift the object, and return what happened.
-
-    The object is simulated at `PlacedObject.X_TO_simulated`. If the closed hand may lift, it always
-    lifts until it is certain whether it holds, regardless of the section `lift`. Contacts are those
-    of the fingers of the posture's preshape.
-
-    Args:
-        placed: The object on the table, see `place_object`.
-        posture: Wrist and joints, see `simulation.attempts.make_posture`.
-        config: Hand, physics and lift; None for the configuration of the placed object.
-
-    Raises:
-        GraspError: If the posture does not fit the hand, or `placed` is not a placed object.
-        ConfigError: If the object was placed with other values, or the hand cannot have the drive.
-        HandError: If the hand cannot be used.
-    """
-    if not isinstance(placed, PlacedObject):
-        raise GraspError(f"placed must be of place_object, got a {type(placed).__name__}")
-    if not isinstance(posture, Posture):
-        raise GraspError(f"posture must be a Posture, got a {type(posture).__name__}")
-    config = with_whole_lifts(config_for(placed, config))
-    validate_same_objects(config, placed.config, "as the object was placed with")
-    hand = load_hand(config.hand_source)
-    validate_posture(posture, hand)
-    start = start_of(posture, hand)
-    return run_cached(placed.model, placed.X_TO_simulated, start, config)

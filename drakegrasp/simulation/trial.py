@@ -24,7 +24,6 @@ from drakegrasp.simulation.construction import set_materials
 from drakegrasp.simulation.contacts import (
     ClearanceMonitor,
     Contacts,
-    open_hand_collides,
     open_hand_meets,
     read_contacts,
     scrapes,
@@ -245,7 +244,7 @@ def _start(
     # If the open hand is close to a collision, Drake decides whether it collides.
     set_materials(scene, _materials(scene, attempt))
     _place(scene, X_TO, attempt, attempt.closing)
-    return Outcome.START_COLLISION if open_hand_collides(scene) else screened
+    return Outcome.START_COLLISION if open_hand_meets(scene) else screened
 
 
 def _materials(scene: Scene, attempt: Attempt) -> Materials:

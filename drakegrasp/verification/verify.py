@@ -29,8 +29,8 @@ from drakegrasp.runtime.executor import Executor
 from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import run_trial, start_of
+from drakegrasp.simulation.placement import PlacedObject, run_trial
+from drakegrasp.simulation.posture import start_of
 from drakegrasp.simulation.scene_cache import cached_scene, run_cached
 from drakegrasp.simulation.trial import TrialRecord, start_meetings
 from drakegrasp.verification.hints import fit_surface

@@ -19,13 +19,12 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempts import make_posture
 from drakegrasp.simulation.drive import disengage, engage
-from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.placement import PlacedObject, run_trial
 from drakegrasp.simulation.posture import (
     OPENED,
     Posture,
     joint_order,
     opened,
-    run_trial,
     start_of,
 )
 from drakegrasp.simulation.scene import (
