@@ -6,19 +6,21 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, TypeAlias, Unpack
+from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
 import numpy.typing as npt
 
 from drakegrasp.api.verifying import run_verification, verify_by_protocol
 from drakegrasp.cluster.connect import Workers
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.protocols.postures import describe, versions
-from drakegrasp.protocols.protocol import Lift, find_protocol
+from drakegrasp.protocols.protocol import Lift, Protocol, find_protocol
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.scoring.references import REFERENCES
-from drakegrasp.scoring.run import Method, Score
+from drakegrasp.scoring.run import Methods, Score
 from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import GraspRows
@@ -84,35 +86,34 @@ def score(
             of another camera or hand.
         ConfigError, DataError, HandError, MachineError: As `run_verification`.
     """
-    # The predictions, and the rules of the score.
     unknown = [name for name in references if name not in REFERENCES]
     if unknown:
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
-    settings = ("verify.max_tries=1", *overrides)
-    used = dataset_config(dataset, overrides=settings)
+
+    # The rules of the score, and the predictions.
+    overrides = ("verify.max_tries=1", *overrides)
+    config = dataset_config(dataset, overrides=overrides)
+    rule, stored = find_protocol(protocol)
+    in_mujoco = not isinstance(rule, Lift)
+    if in_mujoco and (client or workers.get("scheduler") or workers.get("scheduler_file")):
+        raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
+    settings = _settings(config, overrides, rule, stored)
     name, ranked = ranked_sets(
         predictions, dataset, rows=rows, confidence=confidence, read_as=read_as
     )
-    other = None if against is None else _method(against, dataset, read_as)
-    rule, stored = find_protocol(protocol)
-    peer = not isinstance(rule, Lift)
-    elsewhere = client or workers.get("scheduler") or workers.get("scheduler_file")
-    if peer and elsewhere:
-        raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
-    if peer:
-        require_mujoco("mujoco", "coacd")
+    methods = {name: ranked}
+    if against is not None:
+        methods |= _method(against, dataset, read_as, beside=methods)
 
     # The verdicts, from this process or from workers.
     def try_all(grasps: GraspRows, chosen: Sequence[int], deliver: Deliver) -> None:
-        placed = place_on_rows(grasps, dataset, chosen, config=used, overrides=settings)
-        if peer:
+        placed = place_on_rows(grasps, dataset, chosen, config=config, overrides=overrides)
+        if in_mujoco:
             verify_by_protocol(
                 placed,
-                used,
+                config,
                 protocol,
-                lambda i, result, _: deliver(
-                    placed[i].index, protocol_verdict(placed[i], result[0])
-                ),
+                lambda i, found, _: deliver(placed[i].index, protocol_verdict(found[0])),
                 keep=Path(scratch if out is None else out) / CONVEX_PARTS,
                 workers=workers.get("workers"),
                 show=show,
@@ -122,7 +123,7 @@ def score(
         # This package's own trials.
         run_verification(
             placed,
-            used,
+            config,
             client=client,
             on_result=lambda index, result: deliver(index, verdict_of(result)),
             show=show,
@@ -133,17 +134,14 @@ def score(
     with TemporaryDirectory() as scratch:
         scored = score_predictions(
             dataset,
+            methods,
             try_all,
             train=_training_rows(dataset, references) if train is None else train,
-            predictions=ranked,
-            name=name,
-            against=other,
             references=references,
             per_object=per_object,
-            config=used,
-            overridden=overridden_keys(settings),
+            config=config,
+            settings=settings,
             again=again,
-            protocol={**describe(rule, stored), "versions": _versions()} if peer else None,
             folder=None if out is None else Path(out),
         )
     if out is not None:
@@ -151,19 +149,47 @@ def score(
     return scored
 
 
-def _method(files: object, dataset: GraspDataset, read_as: Mapping[str, str] | None) -> Method:
-    """Return the name and the predictions of another method."""
+def _method(
+    files: object, dataset: GraspDataset, read_as: Mapping[str, str] | None, *, beside: Methods
+) -> Methods:
+    """Return the predictions of another method by its name.
+
+    Raises:
+        GraspError: If they are not files of predictions, or the card could not tell the methods
+            apart.
+    """
     given = [files] if isinstance(files, str | Path) else files
     if not isinstance(given, list | tuple) or not given:
         raise GraspError(f"against must be a file or a list of files, got {files!r}")
     if wrong := [each for each in given if not isinstance(each, str | Path)]:
         raise GraspError(f"against must have files of predictions, got {wrong[0]!r}")
-    return ranked_sets(given, dataset, read_as=read_as)
+    name, ranked = ranked_sets(given, dataset, read_as=read_as)
+    if name in beside or not any(beside.values()):
+        got = name if any(beside.values()) else "no predictions"
+        raise GraspError(
+            f"against must be beside predictions whose file has another name, got {got}"
+        )
+    return {name: ranked}
 
 
-def _versions() -> dict[str, str]:
-    """Return the versions that decide a protocol's verdict; CoACD cuts the objects into parts."""
-    return {**versions(), "coacd": metadata.version("coacd")}
+def _settings(
+    config: Config, overrides: Sequence[str], rule: Protocol, stored: str
+) -> dict[str, Any]:
+    """Return all that decides a verdict apart from the row; CoACD cuts objects for MuJoCo.
+
+    Raises:
+        MachineError: If a package of the protocol is missing.
+    """
+    settings: dict[str, Any] = {
+        "config": config.to_dict(),
+        "overridden": sorted(overridden_keys(overrides)),
+        "versions": installed_versions(config),
+    }
+    if not isinstance(rule, Lift):
+        require_mujoco("mujoco", "coacd")
+        used = {**versions(), "coacd": metadata.version("coacd")}
+        settings["protocol"] = {**describe(rule, stored), "versions": used}
+    return settings
 
 
 def _training_rows(dataset: GraspDataset, references: Sequence[str]) -> GraspDataset:

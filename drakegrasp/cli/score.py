@@ -68,7 +68,7 @@ def score(
         against: Predictions of another method for the same rows: the card contains the difference
             of the headlines. May be given several times, once per training run of that method.
         references: Score these reference rows only; may be given several times: own, nearest image,
-            constant, random, top-down, closing, palm normals, surface. [default: all]
+            constant, random, top-down, closing. [default: all]
         per_object: Maximum number of rows of each object.
         out: Folder of the card and of the verdicts, from which the same command continues.
             [default: nothing is written]

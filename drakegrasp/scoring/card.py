@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from drakegrasp.config import Config
 from drakegrasp.errors import NAMED, counted
 from drakegrasp.frames import Array
 from drakegrasp.scoring.measures import (
-    COVER,
     CURVE_MM,
     LEVEL,
     RESAMPLES,
@@ -24,7 +24,6 @@ from drakegrasp.scoring.measures import (
     Judged,
     by_name,
     calibration,
-    coverage,
     curve,
     difference,
     diversity,
@@ -62,12 +61,10 @@ MEANINGS = {
 def card_of(
     sets: Sequence[Judged],
     grouping: Grouping,
-    own: Mapping[int, Array],
     *,
     dataset: Mapping[str, Any],
+    config: Config,
     settings: Mapping[str, Any],
-    limit: float,
-    oracle: bool,
     known_objects: int,
     new_classes: bool,
     benchmark: Mapping[str, Any] | None,
@@ -78,11 +75,9 @@ def card_of(
     Args:
         sets: The predictions, if there are any, then the reference rows.
         grouping: Grouping of the scored rows.
-        own: By row (3k,), contact points of its own grasp in {O} [m].
         dataset: The scored dataset: file, split, hashes, rows.
+        config: Configuration of the verification.
         settings: Everything that decides a verdict, with the versions.
-        limit: d, the largest distance between requested and reached contacts [m].
-        oracle: Whether more wrist poses than the first were tried.
         known_objects: Number of scored objects that are in the training split.
         new_classes: Whether no class of the scored objects is in the training split.
         benchmark: Description of the frozen benchmark; None for another dataset.
@@ -90,8 +85,8 @@ def card_of(
     """
     # Draw objects or classes, and describe each set; all sets share the draws.
     clusters = grouping.classes if new_classes else grouping.names
-    draws = resample(clusters)
-    described = {each.name: _set_of(each, grouping, own, draws, oracle) for each in sets}
+    draws, oracle = resample(clusters), config.verify.max_tries > 1
+    described = {each.name: _set_of(each, grouping, draws, oracle) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
     by_protocol = "protocol" in settings
     measures = {k: v for k, v in MEANINGS.items() if k != "held_any" or oracle}
@@ -100,7 +95,7 @@ def card_of(
         "form": FORM,
         "headline": {each.name: described[each.name]["measures"]["headline"] for each in tested},
         "measures": BY_PROTOCOL if by_protocol else measures,
-        "limit_mm": round(1e3 * limit, 3),
+        "limit_mm": round(1e3 * config.verify.max_contact_error, 3),
         "rows": len(grouping.rows),
         "objects": len(grouping.names),
         "classes": len(set(grouping.classes)),
@@ -146,7 +141,6 @@ def _negative(of: Estimate) -> Estimate:
 def _set_of(
     judged: Judged,
     grouping: Grouping,
-    own: Mapping[int, Array],
     draws: Array,
     oracle: bool,
 ) -> dict[str, Any]:
@@ -161,7 +155,6 @@ def _set_of(
         "held_within_mm": dict(zip(map(str, CURVE_MM), curve(judged, grouping), strict=True)),
         "penetration": penetration(judged),
         "diversity": diversity(judged),
-        "coverage": coverage(judged, own, grouping),
         "calibration": calibration(judged),
         "outcomes": dict(sorted(Counter(table.outcome.tolist()).items())),
         "invalid": dict(Counter(filter(None, table.reason.tolist())).most_common(NAMED)),
@@ -254,12 +247,11 @@ def _more(card: Mapping[str, Any]) -> list[str]:
     for name, each in sets.items():
         depth = "-" if each["penetration"] is None else f"{1e3 * each['penetration']:.2f}"
         variance = " ".join(map(_percent, each["diversity"] or ())) or "-"
-        rows.append([name, depth, _percent(each["coverage"]), variance])
+        rows.append([name, depth, variance])
     lines += ["", "## Other measures", ""]
-    lines += _table(["set", "penetration [mm]", "coverage [%]", "diversity"], rows)
+    lines += _table(["set", "penetration [mm]", "diversity"], rows)
     lines += [
         "",
-        f"Coverage: share of own grasps within {1e3 * COVER:g} mm of a prediction that counts. "
         "Diversity: per cent of variance in the first one to five principal components of palm and "
         "joints; lower is more diverse.",
         "",

@@ -9,7 +9,7 @@ they are drawn independently of the objects (a two-level bootstrap). The draws c
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -73,8 +73,6 @@ CURVE_MM = tuple(range(0, 61, 5))
 BINS = 5
 #: Number of components of the diversity, as in DexGraspBench.
 COMPONENTS = 5
-#: A grasp covers another if the mean distance between their contacts is at most this [m].
-COVER = 0.02
 #: Measures of a row's best-ranked prediction.
 FIRST = ("headline", "success", "sample", "held", "precision", "stable", "held_any")
 
@@ -105,9 +103,9 @@ class Judged:
             f.name: [getattr(verdict, f.name) for verdict in flat] for f in fields(Verdict)
         }
         lengths = {name: np.array(said[name], float) for name in ("contact_error", "penetration")}
-        several = {name: np.fromiter(said[name], object) for name in ("contacts", "posture")}
+        said["posture"] = np.fromiter(said["posture"], object)
         return Table(
-            said | lengths | several,
+            said | lengths,
             seed=np.repeat(np.arange(len(self.ranked)), [len(each) for each in self.ranked]),
             row=np.concatenate([each.of_row for each in self.ranked]),
             rank=np.concatenate([each.rank for each in self.ranked]),
@@ -247,30 +245,6 @@ def diversity(judged: Judged) -> list[float] | None:
     singular = np.linalg.svd(postures - postures.mean(axis=0), compute_uv=False)
     shares = np.cumsum(singular**2) / max(float((singular**2).sum()), 1e-300)
     return [_rounded(share) for share in shares[:COMPONENTS]]
-
-
-def coverage(judged: Judged, own: Mapping[int, Array], grouping: Grouping) -> float:
-    """Return the fraction of own grasps near a prediction that counts for the same object.
-
-    Args:
-        judged: The set.
-        own: By row (3k,), contact points of its own grasp in {O} [m].
-        grouping: Grouping of the rows.
-    """
-    # Collect the predictions that count, by object.
-    kept = judged.table[judged.table.headline & judged.table.contacts.astype(bool)]
-    objects = grouping.objects[np.searchsorted(grouping.rows, kept.row)]
-    counted: dict[int, list[Array]] = {}
-    for index, contacts in zip(objects.tolist(), kept.contacts, strict=True):
-        counted.setdefault(index, []).append(np.array(contacts).reshape(-1, 3))
-
-    # Find the own grasps that have one near.
-    covered = []
-    for row, index in zip(grouping.rows, grouping.objects.tolist(), strict=True):
-        points = own[row].reshape(-1, 3)
-        away = [np.linalg.norm(points - other, axis=1).mean() for other in counted.get(index, [])]
-        covered.append(float(bool(away) and min(away) <= COVER))
-    return _rounded(grouping.means([covered]).mean())
 
 
 def by_name(judged: Judged, grouping: Grouping, names: Sequence[str]) -> dict[str, float]:

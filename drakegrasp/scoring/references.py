@@ -11,22 +11,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
-from drakegrasp.grasp import pack_grasp, unpack_grasp
+from drakegrasp.grasp import pack_grasp
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.scoring.predicting import propose
 from drakegrasp.scoring.ranking import rank
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempts import Attempts, make_attempts
 from drakegrasp.verification.placing import dataset_config
-from drakegrasp.vision.camera import project, unproject
+from drakegrasp.vision.camera import unproject
 
 #: Number of cells along each edge of the image descriptor.
 CELLS = 16
@@ -41,12 +39,6 @@ NORMAL_LENGTH = 0.05
 DEPTH_OF_GRASP = 0.03
 #: Distance between neighbouring fingers of a grasp from above [m].
 FINGER_SPACING = 0.04
-#: Half the edge of the square of pixels to which a normal is fitted.
-PATCH = 2
-
-
-#: Pixels (n, 2), u and v.
-Pixels: TypeAlias = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,26 +81,11 @@ class Scene:
         """Return the stream of a reference for a row, seeded by the trial of the row."""
         return Stream(self.seed, object_key(name), int(self.data.value("trial_id", row)))
 
-    def visible(self, row: int) -> tuple[Pixels, Array]:
-        """Return the object's pixels in a row, (n, 2) u and v, and their points p_CQ (n, 3) [m]."""
+    def visible(self, row: int) -> Array:
+        """Return the object's points p_CQ (n, 3) that the image of a row shows [m]."""
         image, mask = self.data.value("images", row), self.data.value("masks", row)
         v, u = np.nonzero(mask)
-        pixels = np.column_stack([u, v])
-        return pixels, unproject(self.data.K, pixels, image[3][v, u])
-
-
-def _contact(pixels: Pixels, points: Array, pixel: int) -> tuple[Array, Array]:
-    """Return the point of an object pixel and the normal of a plane through its patch.
-
-    The normal points towards the camera, because the patch is visible.
-    """
-    near = np.abs(pixels - pixels[pixel]).max(axis=1) <= PATCH
-    patch, point = points[near], points[pixel]
-    view = -point / np.linalg.norm(point)
-    if len(patch) < 3:
-        return point, view
-    normal = np.linalg.svd(patch - patch.mean(axis=0))[2][2]
-    return point, normal if normal @ view >= 0.0 else -normal
+        return unproject(self.data.K, np.column_stack([u, v]), image[3][v, u])
 
 
 def own(scene: Scene) -> Array:
@@ -181,7 +158,7 @@ def top_down(scene: Scene) -> Array:
 def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     """Return the grasp (6k,) of `top_down` for a row, with the pose of its camera."""
     # Visible points seen from above, and their axes.
-    p_TQ = transform_points(X_TC, scene.visible(row)[1])
+    p_TQ = transform_points(X_TC, scene.visible(row))
     centroid = p_TQ[:, :2].mean(axis=0)
     centred = p_TQ[:, :2] - centroid
     major, minor = np.linalg.svd(centred.T @ centred)[0].T
@@ -205,44 +182,6 @@ def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     return pack_grasp(transform_points(X_CT, points), rotate_vectors(X_CT, normals))
 
 
-def palm_normals(scene: Scene) -> Array:
-    """Return contacts at which rays about the palm's direction meet the visible surface.
-
-    The rays go through the contacts of the constant grasp, which lie about the palm's direction, or
-    through the object's closest pixel. Points and normals are those of the depth image.
-    """
-    axis = unpack_grasp(scene.constant)[0]
-
-    def choose(scene: Scene, row: int, pixels: Pixels, fingers: int) -> list[int]:
-        targets = project(scene.data.K, axis)
-        return [int(np.argmin(((pixels - uv) ** 2).sum(axis=1))) for uv in targets]
-
-    return _on_surface(scene, choose)
-
-
-def surface_points(scene: Scene) -> Array:
-    """Return random visible points of the object, with the normals of the depth image."""
-
-    def choose(scene: Scene, row: int, pixels: Pixels, fingers: int) -> list[int]:
-        drawn = scene.stream("surface", row).integers(len(pixels), fingers)
-        return [int(pixel) for pixel in drawn]
-
-    return _on_surface(scene, choose)
-
-
-def _on_surface(scene: Scene, choose: Callable[[Scene, int, Pixels, int], Sequence[int]]) -> Array:
-    """Return grasps whose contacts are object pixels that a function chooses for each finger."""
-    grasps = []
-    for row in scene.rows:
-        pixels, points_C = scene.visible(row)
-        fingers = len(scene.data.value("grasps", row)) // 6
-        chosen = choose(scene, row, pixels, fingers)
-        contacts = [_contact(pixels, points_C, pixel) for pixel in chosen]
-        points, normals = zip(*contacts, strict=True)
-        grasps.append(pack_grasp(points, normals))
-    return np.array(grasps)
-
-
 def closing(scene: Scene) -> Attempts:
     """Return for each row the grasp of `propose` that `rank` puts first, for the visible points.
 
@@ -257,7 +196,7 @@ def closing(scene: Scene) -> Attempts:
 
     for i, row in enumerate(scene.rows):
         try:
-            best = _chosen(transform_points(poses[row], scene.visible(row)[1]), hand)
+            best = _chosen(transform_points(poses[row], scene.visible(row)), hand)
         except (GraspError, HandError) as reason:
             reasons[i] = str(reason)
         else:
@@ -302,6 +241,4 @@ REFERENCES = {
     "closing": Reference(
         make=closing, words="proposed and chosen by closing on what is seen", trained=False
     ),
-    "palm normals": Reference(make=palm_normals, words="rays about the palm's direction"),
-    "surface": Reference(make=surface_points, words="random visible points", trained=False),
 }

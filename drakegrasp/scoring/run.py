@@ -7,20 +7,18 @@ become a card. The caller chooses who does the work (`Verify`).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import installed_versions, read_manifest
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError, MachineError
-from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
-from drakegrasp.grasp import unpack_grasp
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
 from drakegrasp.scoring.card import card_of, card_text
@@ -32,8 +30,8 @@ from drakegrasp.simulation.attempts import Attempts, GraspRows, Rows, join_rows
 
 #: Tries n attempts on rows (n,), and calls back with the index and the verdict of each.
 Verify: TypeAlias = Callable[[GraspRows, Sequence[int], Callable[[int, Verdict], None]], object]
-#: The name of a method on a card, and its predictions by training seed.
-Method: TypeAlias = tuple[str, tuple[GraspRows, ...]]
+#: Predictions of each method by training seed, by the name of the method on a card.
+Methods: TypeAlias = Mapping[str, tuple[GraspRows, ...]]
 #: Files of a score.
 CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"
 
@@ -78,55 +76,45 @@ class Score:
 
 def score(
     data: GraspDataset,
+    methods: Methods,
     verify: Verify,
     *,
     train: GraspDataset,
-    predictions: Sequence[GraspRows],
-    name: str,
-    against: Method | None,
     references: Sequence[str],
     per_object: int | None,
     config: Config,
-    overridden: Collection[str],
+    settings: Mapping[str, Any],
     again: str,
-    protocol: Mapping[str, Any] | None = None,
     folder: Path | None = None,
 ) -> Score:
     """Return the score of predictions.
 
     Args:
         data: The dataset; its split has the rows.
+        methods: Predictions of each method by training seed, by the name of the method on the card;
+            without any, only the reference rows are scored.
         verify: Tries grasps.
         train: Training rows for the reference rows.
-        predictions: Predictions by training seed; if empty, only the reference rows are scored.
-        name: Name of the predictions on the card.
-        against: Name and predictions of another method, for the same rows.
         references: Names of the reference rows, in the order of the card.
         per_object: Maximum number of rows of each object; None for all.
         config: Configuration of the verification.
-        overridden: Paths of the keys that the caller sets; they take precedence over values drawn
-            for a row.
+        settings: All that decides a verdict apart from the row, with the versions.
         again: The command that creates the card again.
-        protocol: Name, source, numbers and versions of a protocol that replaces the lift.
         folder: Folder that stores verdicts, so that the same call can continue; None stores none.
 
     Raises:
-        GraspError: If there is nothing to score, the predictions are for different rows, the
-            training rows are of another camera or hand, or the other method has the same name as
-            the predictions.
+        GraspError: If there is nothing to score, the predictions are for different rows, or the
+            training rows are of another camera or hand.
     """
-    _validate_train(data, train)
-    if against is not None and (not predictions or against[0] == name):
-        raise GraspError(
-            "against must be beside predictions whose file has another name, got "
-            f"{name if predictions else 'no predictions'}"
-        )
-
     # The rows, and the sets that are scored on them.
-    methods = [(name, predictions), *([against] if against else [])]
-    rows = _chosen_rows(data, [each for _, own in methods for each in own], per_object)
+    _validate_train(data, train)
+    rows = _chosen_rows(data, [each for ranked in methods.values() for each in ranked], per_object)
     grouping = _grouping(data, rows)
-    sets = {name: tuple(_of_rows(each, rows) for each in own) for name, own in methods if own}
+    sets = {
+        name: tuple(_of_rows(each, rows) for each in ranked)
+        for name, ranked in methods.items()
+        if ranked
+    }
     scene = Scene(data=data, rows=rows, train=train)
     for name in references:
         if len(train) or not REFERENCES[name].trained:
@@ -135,30 +123,22 @@ def score(
         raise GraspError("there must be predictions or reference rows to score, got none")
 
     # Their verdicts: all predictions without a verdict are tried together.
-    versions = installed_versions(config)
-    settings = {
-        "config": config.to_dict(),
-        "overridden": sorted(overridden),
-        "versions": versions,
-        **({} if protocol is None else {"protocol": protocol}),
-    }
-    verdicts = _verdicts([each for own in sets.values() for each in own], data, settings, verify,
-                         folder)  # fmt: skip
+    with closing(VerdictFile(None if folder is None else folder / VERDICTS)) as known:
+        tables = [each for ranked in sets.values() for each in ranked]
+        verdicts = iter(_verdicts(tables, data, settings, verify, known))
     judged = tuple(
-        Judged(name=name, ranked=own, verdicts=tuple(next(verdicts) for _ in own))
-        for name, own in sets.items()
+        Judged(name=name, ranked=ranked, verdicts=tuple(next(verdicts) for _ in ranked))
+        for name, ranked in sets.items()
     )
     card = card_of(
         judged,
         grouping,
-        dict(zip(rows, own_contacts(data, rows), strict=True)),
         dataset=_described(data, rows),
+        config=config,
         settings=settings,
-        limit=config.verify.max_contact_error,
-        oracle=config.verify.max_tries > 1,
         known_objects=_known_objects(grouping.names, data, train),
         new_classes=not set(grouping.classes) & _texts(train, "class_name"),
-        benchmark=read_benchmark(data.path.parent, config, versions),
+        benchmark=read_benchmark(data.path.parent, config, settings["versions"]),
         again=again,
     )
     times = {each.name: float(np.median(each.table.seconds)) for each in judged}
@@ -224,59 +204,65 @@ def _grouping(data: GraspDataset, rows: Sequence[int]) -> Grouping:
 
 
 def _verdicts(
-    sets: Sequence[GraspRows],
+    tables: Sequence[GraspRows],
     data: GraspDataset,
     settings: Mapping[str, Any],
     verify: Verify,
-    folder: Path | None,
-) -> Iterator[tuple[Verdict, ...]]:
-    """Return the verdicts on each of several sets of predictions; equal predictions share one."""
-    # The files of the two cameras have the same content.
-    content = f"{data.content} {data.camera}"
-    keys = []
-    for each in sets:
-        frame, shapes = "", [""] * len(each)
-        if isinstance(each, Attempts):
-            # Palm poses alone may differ only in their preshape.
-            frame = f" posture in {each.frame}"
-            shapes = [name and f" of {name}" for name in each.preshape]
-        numbers = zip(shapes, each.of_row.tolist(), each.numbers(), strict=True)
-        keys.append([verdict_key(settings, content + frame + s, *of) for s, *of in numbers])
+    known: VerdictFile,
+) -> list[tuple[Verdict, ...]]:
+    """Return the verdicts on each of several tables of predictions; equal predictions share one.
 
-    # Contacts of all sets are tried together, postures file by file. Each verdict is stored as soon
-    # as it is known. Predictions for an object in a resting pose are adjacent: verdicts come in
-    # this order, so none waits for another object.
-    known = VerdictFile(None if folder is None else folder / VERDICTS)
+    Contacts of all tables are tried together, postures table by table.
+    """
+    keys = [_keys(each, data, settings) for each in tables]
+    contacts = [k for k, each in enumerate(tables) if not isinstance(each, Attempts)]
+    postures = [[k] for k in range(len(tables)) if k not in contacts]
+    for part in [contacts, *postures] if contacts else postures:
+        table = join_rows([tables[k] for k in part])
+        _try_unknown(table, [key for k in part for key in keys[k]], data, verify, known)
+    return [tuple(known.verdicts[key] for key in each) for each in keys]
+
+
+def _keys(table: GraspRows, data: GraspDataset, settings: Mapping[str, Any]) -> list[str]:
+    """Return the key of each prediction under these settings."""
+    # The files of the two cameras have the same content.
+    frame, shapes = f"{data.content} {data.camera}", [""] * len(table)
+    if isinstance(table, Attempts):
+        # Palm poses alone may differ only in their preshape.
+        frame = f"{frame} posture in {table.frame}"
+        shapes = [name and f" of {name}" for name in table.preshape]
+    numbers = zip(shapes, table.of_row.tolist(), table.numbers(), strict=True)
+    return [verdict_key(settings, frame + shape, *of) for shape, *of in numbers]
+
+
+def _try_unknown(
+    table: GraspRows, keys: Sequence[str], data: GraspDataset, verify: Verify, known: VerdictFile
+) -> None:
+    """Try the predictions that have no verdict, and store each verdict as soon as it is known.
+
+    Predictions for an object in a resting pose are adjacent: verdicts come in this order, so none
+    waits for another object.
+    """
     objects = data.column("object_props/object_name").tolist()
     resting = data.column("grasp_props/resting").tolist()
-    contacts = [k for k, each in enumerate(sets) if not isinstance(each, Attempts)]
-    postures = [[k] for k in range(len(sets)) if k not in contacts]
-    try:
-        for part in [contacts, *postures] if contacts else postures:
-            table = join_rows([sets[k] for k in part])
-            place = dict[str, tuple[str, int, int, int]]()
-            for i, key in enumerate(key for k in part for key in keys[k]):
-                row = int(table.of_row[i])
-                if key not in known.verdicts:
-                    place.setdefault(key, (objects[row], resting[row], row, i))
-            if tried := sorted(place, key=lambda key: place[key]):
-                chosen = [place[key] for key in tried]
-                verify(
-                    table.at([i for *_, i in chosen]),
-                    [row for _, _, row, _ in chosen],
-                    partial(_keep, known, tried),
-                )
-            if missing := [key for key in tried if key not in known.verdicts]:
-                raise MachineError(
-                    f"each prediction must have a verdict, got none for {len(missing)}"
-                )
-    finally:
-        known.close()
-    return (tuple(known.verdicts[key] for key in each) for each in keys)
+    place = dict[str, tuple[str, int, int, int]]()
+    for i, key in enumerate(keys):
+        row = int(table.of_row[i])
+        if key not in known.verdicts:
+            place.setdefault(key, (objects[row], resting[row], row, i))
+    if not place:
+        return
 
-
-def _keep(known: VerdictFile, keys: Sequence[str], index: int, verdict: Verdict) -> None:
-    known.add(keys[index], verdict)
+    # Verdicts are stored in the order of the trials.
+    tried = sorted(place, key=place.__getitem__)
+    chosen = [place[key] for key in tried]
+    verify(
+        table.at([i for *_, i in chosen]),
+        [row for _, _, row, _ in chosen],
+        lambda index, verdict: known.add(tried[index], verdict),
+    )
+    if missing := [key for key in tried if key not in known.verdicts]:
+        raise MachineError(f"each prediction must have a verdict, got none for {len(missing)}")
 
 
 def _of_rows(table: Rows, rows: Sequence[int]) -> Rows:
@@ -316,16 +302,3 @@ def _described(data: GraspDataset, rows: Sequence[int]) -> dict[str, Any]:
         "content": data.content,
         "rows_sha256": rows_digest(data, rows),
     }
-
-
-def own_contacts(data: GraspDataset, rows: Sequence[int]) -> list[Array]:
-    """Return the contact points (3k,) in {O} [m] of the own grasp of each row."""
-    X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[list(rows)])
-    X_WT = unpack_pose(data.column("object_props/frame_world2work")[list(rows)])
-    X_WO = unpack_pose(data.column("object_props/frame_world2obj")[list(rows)])
-    X_OC = invert_pose(X_WO) @ X_WT @ X_TC
-    grasps = data.column("grasps")[list(rows)]
-    return [
-        transform_points(X, unpack_grasp(grasp)[0]).ravel()
-        for X, grasp in zip(X_OC, grasps, strict=True)
-    ]

@@ -28,7 +28,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
 from drakegrasp.simulation.attempts import EACH, Attempts, GraspRows, Rows, ranked
-from drakegrasp.verification.placing import PlacedGrasp, dataset_config
+from drakegrasp.verification.placing import dataset_config
 from drakegrasp.verification.prediction import read_several
 from drakegrasp.verification.result import Verification
 
@@ -149,8 +149,6 @@ class Verdict:
         contact_error: Largest distance between requested and reached contacts [m]; None if a
             fingertip did not touch; 0 for a posture that holds, because it requests no contacts.
         penetration: Largest penetration after closing [m]; None if the hand did not close.
-        contacts: (3k,), the requested points in {O} [m], or for a posture the points after closing;
-            empty for an invalid row.
         posture: Position [m], rotation vector [rad] and joints after closing in {O}; empty if the
             hand did not close.
         seconds: Wall-clock time [s].
@@ -166,7 +164,6 @@ class Verdict:
     held_any: bool
     contact_error: float | None
     penetration: float | None
-    contacts: tuple[float, ...]
     posture: tuple[float, ...]
     seconds: float
     reason: str = ""
@@ -179,10 +176,10 @@ class Verdict:
 
 def verdict_of(result: Verification) -> Verdict:
     """Return the part of a verification that a score stores."""
-    first, farthest, p_OQ = result.first, result.farthest_contact, result.p_OQ
+    first, farthest = result.first, result.farthest_contact
     closed = None if first is None else first.trial.closed
-    if result.grasp.postures and closed is not None:
-        farthest, p_OQ = (0.0 if result.held else math.nan), closed.contacts.p_OQ
+    if result.grasp.postures and result.held:
+        farthest = 0.0
     return Verdict(
         outcome=result.outcome.label,
         success=result.success,
@@ -193,14 +190,13 @@ def verdict_of(result: Verification) -> Verdict:
         held_any=result.held_any,
         contact_error=_rounded(farthest) if math.isfinite(farthest) else None,
         penetration=None if closed is None else _rounded(np.nanmax(closed.contacts.penetration)),
-        contacts=_tuple(p_OQ),
         posture=() if closed is None or first is None else _posture(first.trial.X_OG, closed.q),
         seconds=sum(result.seconds.values()),
         reason=result.reason if result.outcome is Outcome.INVALID else "",
     )
 
 
-def protocol_verdict(grasp: PlacedGrasp, found: PostureVerdict) -> Verdict:
+def protocol_verdict(found: PostureVerdict) -> Verdict:
     """Return the part that a score stores of a prediction tried by a MuJoCo protocol.
 
     A protocol only decides on success, which is then used for all measures.
@@ -212,7 +208,6 @@ def protocol_verdict(grasp: PlacedGrasp, found: PostureVerdict) -> Verdict:
         **dict.fromkeys(measures, found.success),
         contact_error=None,
         penetration=_rounded(found.penetration) if math.isfinite(found.penetration) else None,
-        contacts=_tuple(grasp.in_object_frame()[0]),
         posture=(),
         seconds=0.0,
         reason=found.reason.partition(": ")[2] if outcome == Outcome.INVALID.label else "",
@@ -223,17 +218,12 @@ def _posture(X_OG: Array, q: Array) -> tuple[float, ...]:
     from scipy.spatial.transform import Rotation
 
     turned = Rotation.from_matrix(X_OG[:3, :3]).as_rotvec()
-    return _tuple(np.concatenate([X_OG[:3, 3], turned, q]))
+    values = np.concatenate([X_OG[:3, 3], turned, q])
+    return tuple(map(_rounded, values)) if np.isfinite(values).all() else ()
 
 
 def _rounded(value: Any) -> float:
     return round(float(value), _DIGITS) + 0.0
-
-
-def _tuple(values: Array | None) -> tuple[float, ...]:
-    if values is None or not np.isfinite(values).all():
-        return ()
-    return tuple(_rounded(value) for value in np.ravel(values))
 
 
 class VerdictFile:
@@ -255,10 +245,9 @@ class VerdictFile:
     def _read(self, line: bytes) -> None:
         try:
             tree = parse_json(line)
-            tree.setdefault("reason", "")  # files of older versions
             values = {f.name: tree[f.name] for f in fields(Verdict)}
-            as_tuples = {name: tuple(values[name]) for name in ("contacts", "posture")}
-            self.verdicts[str(tree["key"])] = Verdict(**(values | as_tuples))
+            values["posture"] = tuple(values["posture"])
+            self.verdicts[str(tree["key"])] = Verdict(**values)
         except (ValueError, KeyError, TypeError):
             return
 

@@ -23,7 +23,6 @@ FAILS = Verdict(
     held_any=False,
     contact_error=None,
     penetration=None,
-    contacts=(0.0,) * 9,
     posture=(),
     seconds=1.0,
 )
@@ -102,7 +101,6 @@ class FakeVerify:
                 held_any=held,
                 first=None,
                 farthest_contact=0.001 if held else np.nan,
-                p_OQ=np.zeros((3, 3)),
                 seconds={"simulate": 0.5},
             )
             on_result(index, verdict_of(found))

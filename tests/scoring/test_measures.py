@@ -12,7 +12,6 @@ from drakegrasp.scoring.measures import (
     Judged,
     by_name,
     calibration,
-    coverage,
     curve,
     difference,
     diversity,
@@ -126,13 +125,6 @@ def test_diversity_is_one_along_a_line_and_falls_with_directions():
 
     assert variance(np.outer([0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 0.0]))[0] == 1.0
     assert variance(np.eye(4))[0] == pytest.approx(1 / 3, abs=1e-6)
-
-
-def test_coverage_is_of_own_grasps_with_a_good_one_near():
-    near = replace(verdict("sample"), contacts=(0.01,) * 9)
-    one = of_verdicts(near, verdict("fails"), verdict("sample"))
-    own = {0: np.zeros(9), 1: np.full(9, 0.015), 2: np.full(9, 0.5)}
-    assert coverage(one, own, grouping(0, 0, 1)) == 0.5
 
 
 def test_classes_are_means_of_their_objects():

@@ -13,14 +13,15 @@ import pytest
 from helpers.datasets import OTM, OTO, make_dataset
 from helpers.scores import FakeVerify
 
-from drakegrasp.dataset.manifest import read_manifest, write_manifest
+import drakegrasp as dg
+from drakegrasp.dataset.manifest import installed_versions, read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.foreign_files import read_json
 from drakegrasp.scoring.card import card_text
-from drakegrasp.scoring.run import VERDICTS, own_contacts, score
+from drakegrasp.scoring.run import VERDICTS, score
 from drakegrasp.scoring.verdict import ranked_sets
-from drakegrasp.verification.placing import dataset_config, place_on_rows
+from drakegrasp.verification.placing import dataset_config
 
 
 @pytest.fixture(scope="module")
@@ -30,20 +31,23 @@ def data(tmp_path_factory):
     return GraspDataset(out / OTO, split="test")
 
 
-def scored(data, /, given=(), *, tries=None, **changes):
+def scored(data, /, given=(), *, tries=None, others=None, overridden=(), **changes):
     """Return the score of predictions beside two reference rows; own grasps hold."""
     name, ranked = ranked_sets(given, data)
+    config = changes.get("config", dataset_config(data, overrides=("verify.max_tries=1",)))
     values: dict[str, Any] = {
         "data": data,
+        "methods": {name: ranked, **(others or {})},
         "verify": tries or FakeVerify(is_own(data)),
         "train": GraspDataset(data.path, split="train"),
-        "predictions": ranked,
-        "name": name,
-        "against": None,
         "references": ("own", "constant"),
         "per_object": None,
-        "config": dataset_config(data, overrides=("verify.max_tries=1",)),
-        "overridden": ("verify.max_tries",),
+        "config": config,
+        "settings": {
+            "config": config.to_dict(),
+            "overridden": ["verify.max_tries", *overridden],
+            "versions": installed_versions(config),
+        },
         "again": "drakegrasp score",
     }
     return score(**(values | changes))
@@ -89,7 +93,7 @@ def other_friction(data):
 
 
 def same_friction_for_all_rows(data):
-    return {"overridden": ("physics.friction_hand", "verify.max_tries")}
+    return {"overridden": ["physics.friction_hand"]}
 
 
 def other_camera(data):
@@ -132,7 +136,7 @@ def test_another_method_stands_beside_the_predictions(data):
     """Of all seeds, on the same rows, and before the reference rows."""
     grasps, rest = data.column("grasps"), np.zeros((len(data), 18))
     other = ranked_sets(grasps, data)[1] + ranked_sets(rest, data)[1]
-    card = scored(data, rest, against=("before", other), per_object=1).card
+    card = scored(data, rest, others={"before": other}, per_object=1).card
     assert list(card["sets"]) == ["predictions", "before", "own", "constant"]
     assert card["sets"]["before"]["predictions"] == 2 * card["rows"] == 4
     assert card["above"]["predictions"]["before"]["value"] == -0.5
@@ -145,16 +149,19 @@ def test_another_method_stands_beside_the_predictions(data):
 def test_predictions_for_different_rows_are_refused(data):
     one = ranked_sets(data.column("grasps")[:1], data, rows=[0])[1]
     other = ranked_sets(data.column("grasps")[:1], data, rows=[1])[1]
-    for changes in ({"predictions": one + other}, {"predictions": one, "against": ("b", other)}):
+    for methods in ({"a": one + other}, {"a": one, "b": other}):
         with pytest.raises(GraspError, match="must have predictions for the rows"):
-            scored(data, **changes)
+            scored(data, methods=methods)
 
 
-def test_a_method_that_the_card_could_not_tell_is_refused(data):
-    name, grasps = ranked_sets(data.column("grasps"), data)
-    for given, of in ((data.column("grasps"), name), ((), "no predictions")):
+def test_a_method_that_the_card_could_not_tell_is_refused(data, tmp_path):
+    files = [tmp_path / "net.npy", tmp_path / "older" / "net.npy"]
+    files[1].parent.mkdir()
+    for file in files:
+        np.save(file, data.column("grasps"))
+    for given, of in ((files[0], "net.npy"), ((), "no predictions")):
         with pytest.raises(GraspError, match=f"against must be .* has another name, got {of}"):
-            scored(data, given, against=(name, grasps))
+            dg.score(given, data, against=files[1])
 
 
 def other_hand(data):
@@ -213,19 +220,12 @@ def test_objects_of_equal_names_and_other_meshes_are_other_objects(data, tmp_pat
     assert TRAINED_ON in card["warnings"]
 
 
-def test_own_contacts_are_those_that_are_tried(data):
-    placed = place_on_rows(data.column("grasps"), data, config=dataset_config(data))
-    for each in placed:
-        found = own_contacts(data, [each.index])[0]
-        np.testing.assert_allclose(found.reshape(3, 3), each.in_object_frame()[0], atol=1e-6)
-
-
 def test_files_of_a_card_are_whole_and_come_again(data, tmp_path):
     predicted = np.repeat(data.column("grasps")[:, None], 5, axis=1).astype(float)
     predicted[:, 1:] = 0.0
     confidence = np.linspace(0.9, 0.1, 5 * len(data)).reshape(len(data), 5)
     _, ranked = ranked_sets(predicted, data, confidence=confidence)
-    made = scored(data, predictions=ranked, name="net")
+    made = scored(data, methods={"net": ranked})
     paths = made.save(tmp_path)
     assert read_json(paths[0]) == made.card
     groups = made.card["sets"]["net"]["calibration"]
