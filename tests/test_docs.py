@@ -333,3 +333,10 @@ def test_the_table_of_scripts_names_every_script_and_no_other() -> None:
     table = read(ROOT / "pipelines" / "README.md")
     files = {path.name for path in (ROOT / "pipelines").rglob("*.py")}
     assert set(re.findall(r"\b(\w+\.py)`", table)) == files
+
+
+def test_scripts_that_the_nightly_run_names_exist() -> None:
+    names = re.findall(r"[\w/]+\.py\b", read(ROOT / ".ci" / "nightly"))
+    assert names
+    for name in names:
+        assert (ROOT / name).is_file() or (ROOT / "pipelines/measurements" / name).is_file(), name
