@@ -380,10 +380,7 @@ class PrivateCluster(SpecCluster):
                 "silence_logs": logging.CRITICAL,
             },
         }
-        scheduler = {
-            "cls": _QuietScheduler,
-            "options": {**server, "port": 0, "dashboard": False},
-        }
+        scheduler = {"cls": _QuietScheduler, "options": {**server, "port": 0, "dashboard": False}}
         try:
             super().__init__(
                 dict.fromkeys(range(workers), nanny),

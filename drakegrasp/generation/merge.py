@@ -39,11 +39,7 @@ _FREE = ("samples_patience", *_ENDS)
 
 
 def merge(
-    into: Path,
-    outs: Sequence[Path],
-    *,
-    overrides: Sequence[str] = (),
-    progress: Report = silent,
+    into: Path, outs: Sequence[Path], *, overrides: Sequence[str] = (), progress: Report = silent
 ) -> Assembly:
     """Merge several datasets into a new one, which appears when it is complete.
 

@@ -35,31 +35,13 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.prepared_objects import with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import palms_in_files
-from drakegrasp.errors import (
-    DataError,
-    GraspError,
-    counted,
-    listed,
-    printable,
-)
+from drakegrasp.errors import DataError, GraspError, counted, listed, printable
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.directory import BuildDirectory
-from drakegrasp.generation.prepare import (
-    DrawTask,
-    PrepareTask,
-    draw_palms,
-    find_entry,
-    prepare_one,
-)
+from drakegrasp.generation.prepare import DrawTask, PrepareTask, draw_palms, find_entry, prepare_one
 from drakegrasp.generation.target import Target
-from drakegrasp.generation.work_unit import (
-    UnitSummary,
-    WorkUnit,
-    find_tasks,
-    find_units,
-    run_unit,
-)
+from drakegrasp.generation.work_unit import UnitSummary, WorkUnit, find_tasks, find_units, run_unit
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, WorkerPool

@@ -13,12 +13,7 @@ from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.dataset.trials import Trials
-from drakegrasp.generation.attempts import (
-    TrialSetup,
-    find_attempt,
-    trial_rows,
-    try_attempt,
-)
+from drakegrasp.generation.attempts import TrialSetup, find_attempt, trial_rows, try_attempt
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.recording import record_attempt

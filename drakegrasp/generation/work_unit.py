@@ -40,13 +40,7 @@ from drakegrasp.generation.directory import DatasetTask
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, trim_memory
 from drakegrasp.runtime.files import disk_full_named
-from drakegrasp.runtime.journal import (
-    ATTEMPT,
-    Journal,
-    Verdict,
-    inject_fault,
-    open_journal,
-)
+from drakegrasp.runtime.journal import ATTEMPT, Journal, Verdict, inject_fault, open_journal
 from drakegrasp.simulation.attempt import Attempt, is_drawn
 from drakegrasp.simulation.scene_cache import repeat_disturbed
 from drakegrasp.simulation.screen import Prediction

@@ -237,11 +237,7 @@ def open_journal(
 
     # The first line has the history; the record and faulthandler's text follow.
     line = json.dumps(
-        {
-            "unit": dict(identity),
-            "deaths": history.deaths,
-            "crash_loop": history.crash_loop,
-        },
+        {"unit": dict(identity), "deaths": history.deaths, "crash_loop": history.crash_loop},
         ensure_ascii=False,
     ).encode()
     start = len(line) + 1

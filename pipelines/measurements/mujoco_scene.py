@@ -155,10 +155,7 @@ def _add_wrist(spec: mujoco.MjSpec) -> mujoco.MjsBody:
         set_inertia(parent, CARRIER_MASS, np.zeros(3), CARRIER_INERTIA * np.eye(3))
         parent.gravcomp = 1.0
         parent.add_joint(
-            name=f"wrist_{name}",
-            type=mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=axis,
-            armature=IMMOVABLE,
+            name=f"wrist_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, armature=IMMOVABLE
         )
     return parent
 

@@ -154,11 +154,7 @@ def test_what_jobqueue_yaml_states_stays_shell_code(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "text", "words"),
     [
-        (
-            "slurm",
-            "disk=1GB",
-            "KEY=VALUE with KEY one of queue, project, account, ",
-        ),
+        ("slurm", "disk=1GB", "KEY=VALUE with KEY one of queue, project, account, "),
         ("slurm", "queue", "KEY=VALUE with KEY one of queue,"),
         ("htcondor", "queue=a", "KEY=VALUE with KEY one of disk, submit_command_extra,"),
     ],

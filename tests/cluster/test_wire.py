@@ -118,10 +118,7 @@ def test_files_go_once_and_results_come_back(
 
 
 def test_builds_at_the_same_time_keep_their_copies_and_share_a_process(
-    client: Client,
-    out: Path,
-    fetched: Callable[[], list[str]],
-    monkeypatch: pytest.MonkeyPatch,
+    client: Client, out: Path, fetched: Callable[[], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put(out, 4)
     start = Mock(wraps=ProcessApart)
@@ -305,10 +302,7 @@ def kill_after(count: int, pid: int, function: Callable[..., Any]) -> Callable[.
 def test_worker_that_joins_later_must_see_what_the_others_do(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with (
-        connect(workers=1) as client,
-        checked_workers(client, load_config(), tmp_path) as travels,
-    ):
+    with connect(workers=1) as client, checked_workers(client, load_config(), tmp_path) as travels:
         assert not travels
         (probe,) = tmp_path.iterdir()
         probe.unlink()

@@ -37,9 +37,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> BuildReport:
     return build(folder / "meshes", folder / "out", config)
 
 
-def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(
-    report: BuildReport,
-) -> None:
+def test_a_grasp_without_an_optional_finger_is_a_success_but_no_sample(report: BuildReport) -> None:
     assert report.assembly is not None and report.assembly.removed[Removal.MISSING_FINGER] == 1
     assert check_dataset(report.out) == []
     with h5py.File(report.out / "trials.hdf5") as file:

@@ -211,9 +211,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
 
 
 @pytest.mark.nightly
-def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(
-    tmp_path: Path,
-) -> None:
+def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(tmp_path: Path) -> None:
     """Whatever runs them takes the same option, and so do the lines that other commands print."""
     rule = "class {}:\n  def keep(self, successes): return successes.trial_id.argsort() % 2 == 0\n"
     for name in ("Even", "Half"):

@@ -9,15 +9,7 @@ import h5py
 import pytest
 from click.testing import CliRunner
 from cross_check import GROUPS, agreement, draw_lifts, main
-from helpers.datasets import (
-    AFTER_LIFT,
-    BOXES,
-    OUTCOMES,
-    SLIPPED,
-    TRIALS,
-    change,
-    make_dataset,
-)
+from helpers.datasets import AFTER_LIFT, BOXES, OUTCOMES, SLIPPED, TRIALS, change, make_dataset
 from scipy.stats import binomtest
 
 from drakegrasp.errors import DataError

@@ -58,8 +58,7 @@ def test_cube_is_held_across_its_faces(baseline: MujocoBaseline, cube: ObjectMod
 
 
 @pytest.mark.parametrize(
-    ("standoff", "outcome"),
-    [(0.3, Outcome.MISSING_FINGERTIP), (0.001, Outcome.START_COLLISION)],
+    ("standoff", "outcome"), [(0.3, Outcome.MISSING_FINGERTIP), (0.001, Outcome.START_COLLISION)]
 )
 def test_attempts_fail_where_they_should(
     baseline: MujocoBaseline, cube: ObjectModel, standoff: float, outcome: Outcome

@@ -55,11 +55,7 @@ def running_slurm(folder: Path) -> Iterator[dict[str, str]]:
     host = socket.gethostname().partition(".")[0]
     conf = folder / "slurm.conf"
     text = _CONF.format(
-        host=host,
-        folder=folder,
-        controller=free_port(),
-        node=free_port(),
-        partition=PARTITION,
+        host=host, folder=folder, controller=free_port(), node=free_port(), partition=PARTITION
     )
     conf.write_text(text)
     for name in ("state", "spool"):
