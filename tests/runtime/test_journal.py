@@ -12,6 +12,7 @@ import pytest
 from helpers import faults
 from helpers.tiers import few, in_second_tier
 
+from drakegrasp.errors import MachineError
 from drakegrasp.runtime.journal import (
     GIVE_UP_DEATHS,
     HUNG_DEATHS,
@@ -19,6 +20,7 @@ from drakegrasp.runtime.journal import (
     NO_JOURNAL,
     PREPARE_DEATHS,
     SILENT_DEATHS,
+    Journal,
     Verdict,
     _History,
     open_journal,
@@ -143,7 +145,8 @@ def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> N
 )
 def test_what_is_no_journal_is_ignored(tmp_path: Path, content: str) -> None:
     (tmp_path / "journal").write_text(content)
-    assert deaths_until_done(tmp_path / "journal")[0] == 0
+    with open_journal(tmp_path / "journal", UNIT) as journal:
+        assert journal.unresolved == []
 
 
 def test_journal_of_another_unit_is_ignored(tmp_path: Path) -> None:
@@ -177,12 +180,13 @@ def test_kill_leaves_a_journal_without_a_mark(tmp_path: Path) -> None:
 
 
 def test_unit_that_dies_for_nothing_is_given_up() -> None:
-    """Before its first step no step is at fault."""
+    """Before its first step no step is at fault, whatever the process died of."""
     history = _History()
-    for _ in range(GIVE_UP_DEATHS):
-        history.add("start", 0, b"")
-        assert history.verdict("start") is None
-    assert history.crash_loop == GIVE_UP_DEATHS
+    for number in range(GIVE_UP_DEATHS):
+        Journal(None, 0, history).validate_no_loop("mug")
+        history.add("start", 0, b"Fatal Python error" * (number % 2))
+    with pytest.raises(MachineError, match=r"^mug: the worker died 20 times in a row; is there en"):
+        Journal(None, 0, history).validate_no_loop("mug")
 
 
 @pytest.mark.parametrize(
