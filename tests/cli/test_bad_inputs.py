@@ -7,23 +7,20 @@ through a command that reads the file, and names all kinds that had another answ
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import uvicorn
-import yaml
 from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
 from helpers.bad_inputs.kinds import Kind, Workplace
 from helpers.commands import Result
 from helpers.commands import run as run_command
 from helpers.datasets import OTO, REPEATED, TRIALS, make_dataset
-from helpers.scripts import load_script
 from helpers.tiers import in_second_tier
 
 from drakegrasp.dataset.manifest import DIGEST, manifest_digest
@@ -257,6 +254,10 @@ def test_attributes_that_contradict(base: Path, tmp_path: Path, name: str) -> No
     walk(base, tmp_path, name, hdf5_kinds.CONTRADICTIONS[::2], "check")
 
 
+OBJECTS_YAML = b"units: m\nlicence: x\nobjects:\n  1_box_a: {friction: 0.5}\n"
+AUDIT = "audit {meshes} --json {to}/a.json"
+
+
 def walk_file(
     base: Path,
     tmp_path: Path,
@@ -334,97 +335,70 @@ def test_decisions_in_the_dataset(base: Path, tmp_path: Path) -> None:
     walk(base, tmp_path, REJECT, manifests.DECISIONS[::5], "inspect")
 
 
-def test_configurations(base: Path, tmp_path: Path) -> None:
-    sound = b"""{seed: 1, builtin: {seed: 0}, candidates: {max: 4},
-        physics: {}, lift: {}, camera: {}, split: {}}"""
-    sound = yaml.safe_dump(yaml.safe_load(sound)).encode()
-    command = "build --objects {meshes} --out {to}/out --config {file} --dry-run"
-    walk_file(base, tmp_path, sound, ".yaml", text_kinds.CONFIG, command)
+#: By what a YAML file is of: sound content, its kinds, and the command that reads it.
+YAML_FILES = {
+    "configuration": (
+        b"builtin: {seed: 0}\ncamera: {}\ncandidates: {max: 4}\nlift: {}\nphysics: {}\nseed: 1\n"
+        b"split: {}\n",
+        text_kinds.CONFIG,
+        "build --objects {meshes} --out {to}/out --config {file} --dry-run",
+    ),
+    "objects": (
+        OBJECTS_YAML,
+        text_kinds.OBJECTS,
+        "build --objects {meshes} --out {to}/out --dry-run --manifest {file}",
+    ),
+    # The same function reads the file for it.
+    "objects of an audit": (OBJECTS_YAML, text_kinds.OBJECTS[::4], f"{AUDIT} --manifest {{file}}"),
+    "hand": (
+        (MODELS / "barrett_hand.yaml").read_bytes(),
+        text_kinds.HAND,
+        "build --objects {meshes} --out {to}/out --set hand={file} --workers 1 --quiet",
+    ),
+}
 
 
-AUDIT = "audit {meshes} --json {to}/a.json"
-
-
-@pytest.mark.parametrize(
-    ("command", "share"),
-    [
-        ("build --objects {meshes} --out {to}/out --dry-run", 1),
-        (AUDIT, 4),  # the same function reads the file for it
-        in_second_tier((AUDIT, 1)),
-    ],
-)
-def test_objects_yaml(base: Path, tmp_path: Path, command: str, share: int) -> None:
-    sound = b"units: m\nlicence: x\nobjects:\n  1_box_a: {friction: 0.5}\n"
-    command += " --manifest {file}"
-    walk_file(base, tmp_path, sound, ".yaml", text_kinds.OBJECTS[::share], command)
-
-
-def test_hands(base: Path, tmp_path: Path) -> None:
-    sound = (MODELS / "barrett_hand.yaml").read_bytes()
-    command = "build --objects {meshes} --out {to}/out --set hand={file} --workers 1 --quiet"
-    walk_file(base, tmp_path, sound, ".yaml", text_kinds.HAND, command)
-
-
-@pytest.mark.parametrize("option", text_kinds.OPTIONS)
-def test_options(base: Path, tmp_path: Path, option: str) -> None:
-    wrong = {}
-    values = text_kinds.OPTIONS[option]
-    for value in values:
-        to = tmp_path / "to"
-        to.mkdir()
-        objects = "builtin" if option in ("--per-class", "--objects-seed") else base / "meshes"
-        words = ["build", "--objects", str(objects), "--out", str(to / "out"), "--quiet"]
-        if option != "--workers" and not option.startswith("--scheduler"):
-            words.append("--dry-run")
-        if option in words:
-            k = words.index(option)
-            del words[k : k + 2]
-        os.chdir(to)
-        result = run([w.replace("{", "{{").replace("}", "}}") for w in (*words, option, value)])
-        answer = wrong_answer(result, (option, option[2:], *_keys(value)))
-        if answer is None and any(to.iterdir()):
-            answer = f"left {[path.name for path in to.iterdir()]}"
-        if answer is not None:
-            wrong[value] = answer
-        os.chdir(tmp_path)
-        shutil.rmtree(to)
-    report(f"option {option}", values, wrong)
+@pytest.mark.parametrize("name", YAML_FILES)
+def test_yaml_files(base: Path, tmp_path: Path, name: str) -> None:
+    sound, kinds, command = YAML_FILES[name]
+    walk_file(base, tmp_path, sound, ".yaml", kinds, command)
 
 
 #: How the lines about some options call them.
-NAMES_OF_OPTIONS = (
-    "candidates.max",
-    "hand",
-    "config",
-    "builtin.",
-    "seed: ",
+NAMES_OF_OPTIONS = ("candidates.max", "hand", "config", "builtin.", "seed: ", "workers")
+#: By command: its options, and its words but for the option.
+OPTIONS_OF = {
+    "build": (text_kinds.OPTIONS, "build --objects {meshes} --out {to}/out --quiet"),
+    "submit": (
+        text_kinds.CLUSTER_OPTIONS,
+        "submit --objects {meshes} --out {to}/out --cluster slurm --host 10.0.0.1 --dry-run "
+        "--workers 2",
+    ),
+    "inspect": ({"--port": text_kinds.PORTS}, "inspect {out}"),
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [(command, option) for command, (found, _) in OPTIONS_OF.items() for option in found],
 )
-
-
-def _keys(value: str) -> Iterator[str]:
-    yield from (value.partition("=")[0], repr(value)[1:-1], *NAMES_OF_OPTIONS)
-
-
-@pytest.mark.parametrize("option", text_kinds.CLUSTER_OPTIONS)
-def test_options_of_a_cluster(base: Path, tmp_path: Path, option: str) -> None:
-    script, wrong = load_script("submit_build").main, {}
-    values = text_kinds.CLUSTER_OPTIONS[option]
-    for value in values:
-        words = ["--objects", str(base / "meshes"), "--out", str(tmp_path / "out"), "--dry-run"]
-        words += ["--cluster", "slurm", "--host", "10.0.0.1"]
-        words += [] if option == "--workers" else ["--workers", "2"]
-        result = run_command(*words, option, value, command=script)
-        answer = wrong_answer(result, (option, option[2:], "workers"))
-        if answer is not None:
-            wrong[value] = answer
-    assert not list(tmp_path.iterdir())
-    report(f"submit_build.py {option}", values, wrong)
-
-
-def test_ports(base: Path) -> None:
+def test_options(
+    base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, option: str
+) -> None:
+    """Of an option that is given twice, the last value counts."""
+    monkeypatch.chdir(tmp_path)
+    values, words = OPTIONS_OF[command][0][option], OPTIONS_OF[command][1]
+    objects = "builtin" if option in ("--per-class", "--objects-seed") else base / "meshes"
+    if command == "build" and option != "--workers" and not option.startswith("--scheduler"):
+        words += " --dry-run"
     wrong = {}
-    for value in text_kinds.PORTS:
-        answer = wrong_answer(run(["inspect", str(base / "out"), "--port", value]), ("--port",))
+    for value in values:
+        given = words.format(meshes=objects, to=tmp_path, out=base / "out").split()
+        result = run([w.replace("{", "{{").replace("}", "}}") for w in (*given, option, value)])
+        names = (option, option[2:], value.partition("=")[0], repr(value)[1:-1], *NAMES_OF_OPTIONS)
+        answer = wrong_answer(result, names)
+        if answer is None and any(tmp_path.iterdir()):
+            answer = f"left {[path.name for path in tmp_path.iterdir()]}"
         if answer is not None:
             wrong[value] = answer
-    report("option --port", text_kinds.PORTS, wrong)
+    report(f"{command} {option}", values, wrong)

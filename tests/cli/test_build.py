@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 import trimesh
 from distributed.security import Security
 from helpers import datasets
 from helpers.builds import start_build, workers_of
-from helpers.commands import run
+from helpers.commands import Result, run
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 from helpers.tiers import in_second_tier
 
@@ -297,6 +298,46 @@ def test_build_connects_with_the_certificates_that_it_is_given(
             assert "must be given together" in run(*build).stderr
     result = run(*build)
     assert result.exit_code == 1 and "(connected)" in result.stderr
+
+
+# What is known of a build beforehand.
+
+
+def dry_run(out: Path, *words: str | Path) -> Result:
+    return run("build", "--objects", "builtin", "--out", out, "--dry-run", *words)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            (),
+            [
+                "128 objects: until 20 samples of each, at most 1,280,000 palm poses in 160,000 "
+                "work units"
+            ],
+        ),
+        (
+            ("--only", "1_mug_1", "--only", "1_mug_1", "--candidates", "101"),
+            ["1 object: at most 101 palm poses in 13 work units"],
+        ),
+    ],
+)
+def test_dry_run_tells_the_most_work_and_writes_nothing(
+    tmp_path: Path, words: tuple[str, ...], said: list[str]
+) -> None:
+    result = dry_run(tmp_path / "out", *words)
+    assert (result.exit_code, result.stdout.splitlines(), result.stderr) == (0, said, "")
+    assert not any(tmp_path.iterdir())
+
+
+def test_dry_run_of_postures_counts_those_that_can_be_tried(tmp_path: Path) -> None:
+    file, out = tmp_path / "palms.npz", tmp_path / "out"
+    names = ["1_mug_1", "1_mug_2", "1_mug_1", "9_jar"]
+    np.savez(file, object=names, position=[[0, 0, 0.2]] * 4, quaternion=[[1, 0, 0, 0]] * 4)
+    assert dry_run(out, "--postures", file).stdout == "2 objects: 3 postures\n"
+    assert dry_run(out, "--postures", file, "--only", "1_mug_1").stdout == "1 object: 2 postures\n"
+    assert not out.exists()
 
 
 @pytest.mark.nightly

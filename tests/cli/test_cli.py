@@ -102,8 +102,9 @@ def test_examples_in_help_texts_are_settings() -> None:
     assert [found[name] for name in ("assemble", "merge", "scenes")] == [*["filters"] * 2, "scenes"]
 
 
-#: What is refused with one line: the words of the command, and some of the line's. `{tmp}` has
-#: `a.npy`, a grasp, `other.h5`, which has one, and nothing else.
+#: What is refused with one line: the words of the command, and some of the line's. The folder has
+#: `a.npy`, a grasp, `short.npy`, one with a number too few, `other.h5`, which has one, `box.obj`,
+#: and nothing else.
 REFUSED = [
     ("--fly", "Unknown command"),
     ("verify a.npy --seed 3", "Unknown option: --seed."),
@@ -115,15 +116,10 @@ REFUSED = [
     ("stats", "requires an argument"),
     ("stats {tmp} more", "Unused Tokens: ['more']"),
     ("replay . x", ""),
-    ("check {tmp}/nowhere", "nowhere"),
-    ("stats {tmp}", "{tmp}"),
-    ("check {tmp}", "{tmp}"),
-    ("assemble {tmp}", "{tmp}"),
-    ("figures {tmp} --quiet", "{tmp}/trials.hdf5: must be the trials"),
     ("build --objects {tmp} --out {tmp}/out --per-class 3", "--per-class must be used with"),
     ("build --objects {tmp} --out {tmp}/out --objects-seed 3", "--objects-seed must be used"),
     ("bench-set {tmp}/bench --only 99_chair_1", "'99_chair_1'"),
-    ("verify gone.npy --object cube.obj", "cube.obj: must be a mesh file"),
+    ("verify gone.npy --object none.obj", "none.obj: must be a mesh file"),
     ("verify a.npy --object gone.obj", "gone.obj: must be a mesh file"),
     ("verify a.npy", "--object MESH or --dataset FILE must be given"),
     ("verify a.npy --dataset a.npy", "a.npy: must be a data file of drakegrasp"),
@@ -133,7 +129,31 @@ REFUSED = [
     ("verify a.npy --object o.obj --out run", "--out must be a file .h5 or .hdf5, got run"),
     ("verify a.npy --object o.obj --out a.npy/x.h5", "must be in a folder that can be"),
     ("verify a.npy --object o.obj --protocol dexgraspbench --out x.h5", "--out must be left out"),
+    ("verify a.npy --object box.obj --units inch", 'Choose from: "m", "cm", "mm".'),
     ("verify a.npy --object o.obj --assets .", "--assets must be used with another --protocol"),
+    *(
+        (f"verify {words} --object box.obj --units cm --out deep/run.h5", said)
+        for words, said in (
+            ("short.npy", "a grasp must be 18 numbers (3 points, then 3 outward normals)"),
+            ("a.npy --frame camera", "--frame must not be camera with --object"),
+            (
+                "a.npy --frame top",
+                'Choose from: "object", "table", "camera", "world", "mesh"',
+            ),
+            ("a.npy --dataset x.hdf5", "--object or --dataset must be given, got both"),
+            ("a.npy --hand octopus", "octopus"),
+            ("a.npy --workers 0", "workers must be at least 1, got 0"),
+            ("a.npy --workers some", "must be a whole number, got"),
+            ("a.npy --split test", "--split must be left out without --dataset, or grasps in an"),
+            ("a.npy --set verify.max_tries=9", "max_tries: must be less than or equal to 5"),
+            ("a.npy --workers 2 --scheduler x", "must not be given with a scheduler"),
+        )
+    ),
+    ("build --objects builtin --out o --dry-run --only 1_jug_1", "only must be names of objects"),
+    (
+        "build --objects builtin --out o --dry-run --set candidates.postures=0123456789abcdef",
+        "candidates.postures must be",
+    ),
     *(
         (command, "must be a path of this machine, got the address")
         for command in (
@@ -147,18 +167,30 @@ REFUSED = [
     ),
 ]
 
+#: The same of commands whose dataset is none, which is no wrong usage.
+NO_DATASET = [
+    ("check {tmp}/nowhere", "nowhere"),
+    ("stats {tmp}", "{tmp}"),
+    ("check {tmp}", "{tmp}"),
+    ("assemble {tmp}", "{tmp}"),
+    ("figures {tmp} --quiet", "{tmp}/trials.hdf5: must be the trials"),
+]
 
-@pytest.mark.parametrize(("command", "words"), REFUSED)
+
+@pytest.mark.parametrize(("command", "words"), [*REFUSED, *NO_DATASET])
 def test_wrong_usage_is_one_line_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     np.save("a.npy", pinch())
+    np.save("short.npy", pinch()[:17])
+    trimesh.creation.box([6.0] * 3).export("box.obj")  # cm
     with h5py.File("other.h5", "w") as file:
         file["grasps"] = pinch()
     before = sorted(tmp_path.rglob("*"))
     result = run(*command.format(tmp=tmp_path).split())
-    assert result.exit_code in (1, 2)
+    assert result.exit_code == (1 if (command, words) in NO_DATASET else 2)
+    assert result.stdout == ""
     assert [error_line(result)] == result.stderr.splitlines()
     assert words.format(tmp=tmp_path) in error_line(result)
     assert sorted(tmp_path.rglob("*")) == before
@@ -427,40 +459,6 @@ def test_grasps_of_a_dataset_are_verified_as_they_are(small_dataset: Path, camer
     # On the surface, so frames and poses were put together rightly.
     assert max(d for line in lines for d in line["surface_distance"]) < 2e-3
     assert any(line["success"] for line in lines)
-
-
-@pytest.mark.sim
-@pytest.mark.parametrize(
-    ("grasp", "arguments", "words"),
-    [
-        (pinch()[:17], [], "a grasp must be 18 numbers (3 points, then 3 outward normals)"),
-        (pinch(), ["--units", "inch"], 'Choose from: "m", "cm", "mm".'),
-        (pinch(), ["--frame", "camera"], "--frame must not be camera with --object"),
-        (pinch(), ["--dataset", "x.hdf5"], "--object or --dataset must be given, got both"),
-        (pinch(), ["--hand", "octopus"], "octopus"),
-        (pinch(), ["--workers", "0"], "workers must be at least 1, got 0"),
-        (pinch(), ["--workers", "some"], "must be a whole number, got"),
-        (pinch(), ["--frame", "palm"], 'Choose from: "object", "table", "camera", "world"'),
-        (
-            pinch(),
-            ["--split", "test"],
-            "--split must be left out without --dataset, or grasps in an HDF5 file",
-        ),
-        (pinch(), ["--set", "verify.max_tries=9"], "max_tries: must be less than or equal to 5"),
-        (pinch(), ["--workers", "2", "--scheduler", "x"], "must not be given with a scheduler"),
-        (pinch(), ["--scheduler", " "], "scheduler must be an address like tls://host:8786"),
-    ],
-)
-def test_what_cannot_be_verified_is_one_line_and_leaves_nothing(
-    cube: Path, tmp_path: Path, grasp: np.ndarray, arguments: list[str], words: str
-) -> None:
-    out = tmp_path / "deep" / "run.h5"
-    command = ["verify", save(tmp_path, grasp), "--object", cube, "--units", "cm", "--out", out]
-    result = run(*command, *arguments)
-    assert result.exit_code == 2
-    assert words in error_line(result)
-    assert result.stdout == ""
-    assert not out.parent.exists()
 
 
 def test_module_runs_as_a_program() -> None:
