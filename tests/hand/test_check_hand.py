@@ -5,16 +5,25 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from helpers.golden import Golden
-from helpers.hands import write_tongs
+import yaml
+from helpers.golden import Golden, points, short
+from helpers.hands import copy_model, write_tongs
 from helpers.tiers import in_second_tier
+from helpers.vendors import box, fixed, link
 
 from drakegrasp.hand.checks import Finding
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import MODELS, hand_names
-from drakegrasp.hand_setup import check_hand
+from drakegrasp.hand.settings import load_config
+from drakegrasp.hand_setup import GRASPS, check_grasp, check_hand, trial_grasps
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.scene import hand_positions
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.wrist_problem import hand_constants
 
 
@@ -22,8 +31,8 @@ def copied(folder: Path, name: str) -> Path:
     """Copy the files of a hand, or write those of the tutorial's; return its hand file."""
     if name == "tongs":
         return write_tongs(folder)
-    for source in MODELS.glob(f"{name}_*"):
-        shutil.copy(source, folder)
+    copy_model(folder, name)
+    shutil.copy(MODELS / f"{name}_hand.yaml", folder)
     return folder / f"{name}_hand.yaml"
 
 
@@ -46,6 +55,9 @@ PALM_SHAPE = (
 SPREAD_LIMIT = "<xyz>0 0 -1</xyz>\n        <limit><lower>0</lower>"
 SPREAD_AXIS = "<child>finger2_spread</child>\n      <axis>\n        <xyz>0 0 1</xyz>"
 MIMIC = "<mimic joint='{}'><multiplier>{}</multiplier></mimic>"
+POST = (
+    link("post", 0.1, box("0.02 0.02 {0}", "0.1 0 {1}")) + fixed("f", "palm", "post") + "</robot>"
+)
 INERTIA = '<inertia ixx="1.86e-3" iyy="3.0e-4" izz="1.74e-3" ixy="0" ixz="0" iyz="-2e-5"/>'
 # fmt: off
 #: The hand, its file, what is replaced by what, the check that fails, and what it says.
@@ -102,6 +114,9 @@ FAULTS = {
     "palm without a shape": (
         "tongs", ".urdf", PALM_SHAPE, "", "palm",
         r"link 'palm', or one that is fixed to it, must have a collision shape, got none"),
+    "post that the palm cannot bring to a table": (
+        "tongs", ".urdf", "</robot>", POST.format(0.3, 0.15), "palm",
+        "the palm must be able to face a table, but the hand reaches 2"),
     "spread joints that the model turns against each other": (
         "barrett", ".sdf", SPREAD_AXIS, SPREAD_AXIS + MIMIC.format("finger1_spread_joint", -1.0),
         "couplings",
@@ -175,6 +190,7 @@ SOUND = {
     "shape of the palm on a link that is fixed to it": (
         "tongs", ".urdf", {PALM_SHAPE: "", "</robot>": SHELL}
     ),
+    "post beside the fingers": ("tongs", ".urdf", {"</robot>": POST.format(0.1, 0.05)}),
     "link above the palm, among the fingers": ("tongs", ".urdf", {"</robot>": MOUNT}),
     "spread joints that the model turns together": (
         "barrett", ".sdf", {SPREAD_AXIS: SPREAD_AXIS + MIMIC.format("finger1_spread_joint", 1.0)}
@@ -192,8 +208,9 @@ def test_a_sound_hand_passes_whatever_else_its_model_has(tmp_path: Path, case: s
     for old, new in changes.items():
         change(path, suffix, old, new)
     assert [finding.text for finding in check_hand(path) if not finding.ok] == []
-    # What is checked can be used.
-    assert len(hand_constants(load_hand(path)).palm) == 8 or name != "tongs"
+    # What is checked can be used: the palm has the corners of one box, or also of the post.
+    corners = 16 if "post" in case else 8
+    assert len(hand_constants(load_hand(path)).palm) == corners or name != "tongs"
 
 
 def test_the_hand_of_the_example_plugin_passes() -> None:
@@ -220,3 +237,91 @@ def test_every_hand_of_the_package_passes(name: str) -> None:
     assert [finding.text for finding in findings if not finding.ok] == []
     assert reported == findings
     assert [finding.name for finding in findings[-2:]] == ["cylinder, level", "sphere, level"]
+
+
+def test_a_ball_is_left_out_if_the_fingers_stand_wider_than_it() -> None:
+    found = check_grasp(load_hand("allegro_four"), load_config(), "sphere")
+    assert (found.ok, found.text) == (True, "left out: the fingers stand too wide for a ball")
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_two_motors_that_push_against_each_other_hold_nothing_along_their_line(
+    tmp_path: Path,
+) -> None:
+    """On a level line friction carries; on an upright one the stronger side gives way."""
+    tree = copy_model(tmp_path, "franka") | {"drive": "torque"}
+    for finger in tree["fingers"]:
+        finger.pop("driven_by", None)
+        finger["force_limit"] = 70.0
+    path = tmp_path / "mine_hand.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    hand = load_hand(path)
+    level, upright = (
+        check_grasp(hand, load_config(), "box", line) for line in ("level", "upright")
+    )
+    assert level.ok, level.text
+    assert not upright.ok, upright.text
+    assert "two motors that push against each other do not hold along their line" in upright.text
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["allegro", "franka", in_second_tier("leap")])
+@pytest.mark.parametrize("drive", ["worm", in_second_tier("locked")])
+def test_a_pinched_box_slips_by_less_than_a_millimetre(name: str, drive: str) -> None:
+    """Within the payload; joints of the preshape keep their positions."""
+    hand, config = load_hand(name), load_config(overrides=[f"lift.drive={drive}"])
+    model, X_TO, pregrasp, _ = next(trial_grasps(hand, "box"))
+    assert model.mass <= hand.payload
+    scene = build_scene(model, config.physics, hand)
+    record = run_attempt(scene, X_TO, pregrasp, config)
+    assert record.outcome is Outcome.SUCCESS
+    assert record.closed.contacts.touching.all()
+    assert record.lift.slip < 1e-3
+    assert record.lift.turn < np.deg2rad(1.0)
+    q = dict(zip(hand.joint_names, hand_positions(scene), strict=True))
+    for joint, position in hand.preshape.items():
+        assert q[joint] == position
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_slip_of_fingers_that_are_pushed_open_is_told() -> None:
+    finding = check_grasp(load_hand("allegro"), load_config(overrides=["lift.drive=torque"]), "box")
+    assert finding.ok
+    locked, own = finding.text.split(" with fingers that are locked, ")
+    assert "slips by 0.1" in locked
+    assert own.startswith("and slips by 6.")
+    assert own.endswith("with fingers that motors of its own strength keep closed")
+
+
+def test_trial_grasps_are_lifted_to_their_end(monkeypatch) -> None:
+    """The one with locked fingers and the one with its own."""
+    configs = []
+
+    def hold(scene, X_TO, attempt, config):
+        configs.append(config)
+        still = SimpleNamespace(slip=0.0, turn=0.0)
+        return TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG, lift=still)
+
+    module = "drakegrasp.hand_setup"
+    monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)
+    monkeypatch.setattr(f"{module}.run_attempt", hold)
+    config = load_config(overrides=["lift.drive=torque", "lift.stop_when=lost_sample"])
+    assert check_grasp(load_hand("allegro"), config, "box").ok
+    assert [each.lift.drive for each in configs] == ["locked", "torque"]
+    assert {each.lift.stop_when for each in configs} == {"never"}
+
+
+@pytest.mark.parametrize("name", ["barrett", "franka"])
+def test_trial_grasps_of_a_hand(name: str, golden: Golden) -> None:
+    """The objects, how they hang, and where the hand starts."""
+    hand, lines = load_hand(name), []
+    for shape, line in GRASPS:
+        for model, X_TO, start, width in trial_grasps(hand, shape, line):
+            size = points([model.half_extents])
+            lines.append(f"{shape} {line} {short(width)} m, {short(model.mass)} kg {size}")
+            lines += [points(X[:3]) for X in (X_TO, start.X_OG)]
+            lines.append(f"{short(start.spread)} {points([start.closing])}")
+    golden(f"grasps/{name}", "\n".join(lines))

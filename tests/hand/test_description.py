@@ -15,6 +15,7 @@ from helpers.hands import (
     changed_finger,
     drake_fingertip_poses,
     write_pincer,
+    write_slider,
     write_tongs,
 )
 from pydrake.geometry import Box, Convex, Cylinder, SceneGraph
@@ -24,10 +25,15 @@ from pydrake.systems.framework import DiagramBuilder
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
 from drakegrasp.hand.checks import overlap_query
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import SLIDE, Hand, load_hand
 from drakegrasp.hand.file_format import MODELS, Coupling
 from drakegrasp.hand.folder import hand_digest
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
+from drakegrasp.hand.kinematics import (
+    closing_levers,
+    coordinate_limits,
+    fingertip_poses,
+    joint_positions,
+)
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import link_shapes
 
@@ -86,37 +92,6 @@ def test_parts_are_closed_convex_and_wound_outwards_with_normals(path: Path) -> 
     assert mesh.is_winding_consistent
     assert mesh.is_convex
     assert mesh.volume == pytest.approx(mesh.convex_hull.volume, rel=1e-6)
-
-
-def cad_sections() -> Array:
-    """Return points (58, 3) on the outline of six sections of the fingertip's CAD mesh [mm]."""
-    x = np.array([0.0, 17.0, 34.5, 41.0, 48.0, 53.0])
-    pad = np.array([9.5, 11.0, 11.0, 10.5, 9.6, 7.9])
-    back = np.array([-9.5, -7.8, -6.2, -5.6, -5.0, -4.5])
-    outline = [
-        *((pad - dy, np.full(6, z)) for dy, z in ((0.0, 5.0), (2.5, 10.1), (4.8, 11.5))),
-        *((back + dy, np.full(6, z)) for dy, z in ((2.2, 11.2), (0.0, 7.8))),
-    ]
-    ends = """-9.5 0 8.3  -6.7 6.7 10.5  -6.7 -6.7 10.5  55.6 5.7 4.6
-              55.6 -4.2 9.4  59 -2.8 4  59 -4 4.6"""
-    right = [np.column_stack((x, y, z)) for y, z in outline]
-    right.append(np.array(ends.split(), dtype=float).reshape(-1, 3))
-    half = np.concatenate(right)
-    return np.concatenate((half, half * [1.0, 1.0, -1.0]))
-
-
-def test_fingertip_deviates_from_its_sections_as_the_models_readme_says() -> None:
-    """The largest distance between convex bodies is that of their extents along a direction."""
-    corners = np.unique(1e3 * trimesh.load(MODELS / "barrett_distal.obj").vertices, axis=0)
-    assert len(corners) == 24
-    # Corners are up to 60 mm from the origin, so that half a degree matters.
-    directions = trimesh.creation.icosphere(subdivisions=7).vertices
-    extents = [(directions @ points.T).max(axis=1) for points in (corners, cad_sections())]
-    deviation = np.abs(extents[0] - extents[1])
-    pad = (directions[:, 1] > 0.2) & (directions[:, 0] > -0.25)
-    for side, most, usual in ((pad, 0.49, 0.32), (~pad, 0.61, 0.51)):
-        assert np.percentile(deviation[side], 95) == pytest.approx(usual, abs=0.01)
-        assert deviation[side].max() == pytest.approx(most, abs=0.01)
 
 
 def shape_points(shape: object) -> Array:
@@ -263,13 +238,10 @@ SLIDING = {
 #: Changes of the gripper's hand file, and what is said of them.
 REFUSALS = {
     "unknown key": ({"colour": "red"}, r"colour: must be a key of a hand file"),
-    "unknown nested key": ({"fingers": changed_finger(nail=1)},
-                           r"fingers\.0\.nail: must be a key of a hand file"),
     "missing key": ({"palm": {"link": "palm"}}, r"palm\.p_BG: must be given"),
     "bad type": ({"fingers": changed_finger(torque_limit="strong")},
                  r"fingers\.0\.torque_limit: must be a valid number.*got 'strong'"),
     "not positive": ({"closing_speed_deg": 0}, r"closing_speed_deg: must be greater than 0, got 0"),
-    "no payload": ({"payload": 0}, r"payload: must be greater than 0, got 0"),
     "another version": ({"version": 2}, r"version: must be 1, .* got 2"),
     "no fingers": ({"fingers": []}, r"fingers: must be a list of at least 1, got \[\]"),
     "two fingers of one name": ({"fingers": changed_finger(name="right")},
@@ -300,13 +272,11 @@ REFUSALS = {
         r"fingers\.0\.torque_limit: must be given, as joint 'left_hinge' turns"),
     "speed of no joint": ({"closing_speed": 0.1},
                           r"closing_speed must be left out: no closing joint slides"),
-    "no stand-off": ({"standoffs": []}, r"standoffs: must be a list of at least 1"),
     "stand-offs in millimetres": ({"standoffs": [0.03, 44]},
                                   r"hand\.yaml: standoffs\.1: must be at most 1 m, got 44 m$"),
     "spreads without a spread": (
         {"spreads_deg": [0, 10]},
         r"spreads_deg must be \[0\] without spread\.joints, got \[0\.0, 10\.0\]"),
-    "no key": ({"packages": {"kit": "gone"}}, r"packages: must be a key of a hand file"),
     "missing file": ({"model": "gone.sdf"},
                      r"model: must be an SDFormat or URDF file, got '.*gone\.sdf'"),
     "not a model": ({"model": "pincer_hand.yaml"}, r"model: must be a file of one model"),
@@ -382,3 +352,48 @@ def test_digest_tells_changed_files_of_one_hand_apart(tmp_path: Path) -> None:
     assert len(digests) == 4
     with pytest.raises(HandError, match="hand must be one of allegro"):
         hand_digest("octopus")
+
+
+def test_a_preshape_fixes_joints_at_their_positions(tmp_path: Path) -> None:
+    """The right finger stands still, and its joint is none that a coordinate drives."""
+    fingers = changed_finger()[:1]
+    hand = load_hand(write_pincer(tmp_path, fingers=fingers, preshape={"right_hinge": 0.3}))
+    assert hand.locked_joints == ("right_hinge",)
+    assert joint_positions(hand, 0.0, [0.5]) == {"left_hinge": 0.5, "right_hinge": 0.3}
+    np.testing.assert_array_equal(coordinate_limits(hand), [[0.0, 0.0], [-0.1, 1.0]])
+    chain = hand.link_chains["right"]
+    assert not chain.gain.any()
+    np.testing.assert_array_equal(chain.offset, [0.3])
+
+
+def test_a_coupling_may_start_at_another_position(tmp_path: Path) -> None:
+    """The right hinge, 0..1, stands at 0.8 - 2 c."""
+    coupled = [{"joint": "right_hinge", "ratio": -2.0, "offset": 0.8}]
+    hand = load_hand(write_pincer(tmp_path, fingers=changed_finger(coupled=coupled)[:1]))
+    assert joint_positions(hand, 0.0, [0.1])["right_hinge"] == pytest.approx(0.6)
+    np.testing.assert_allclose(coordinate_limits(hand)[1], [-0.1, 0.4])
+
+
+def test_fingers_slide(tmp_path: Path) -> None:
+    hand = load_hand(write_slider(tmp_path))
+    np.testing.assert_allclose(hand.closing_speed, [0.1, 0.1])
+    np.testing.assert_allclose(hand.closing_unit, [SLIDE, SLIDE])
+    assert hand.fingers[0].effort_unit == "N"
+    X_GF = fingertip_poses(hand, spread=0.0, closing=[0.01, 0.03])
+    np.testing.assert_allclose(X_GF[:, 1, 3], [-0.03, 0.01], atol=1e-12)
+    np.testing.assert_allclose(
+        X_GF, drake_fingertip_poses(hand, 0.0, np.array([0.01, 0.03])), atol=1e-12
+    )
+    np.testing.assert_allclose(closing_levers(hand, [0.01, 0.03]), [1.0, 1.0])
+
+
+def test_motors_and_couplings_of_the_model_are_left_out(tmp_path: Path) -> None:
+    """The model couples its fingers and limits their efforts: the hand file alone decides."""
+    hand = load_hand(write_slider(tmp_path))
+    plant = MultibodyPlant(0.01)
+    add_model(plant, hand.model)
+    assert (plant.num_actuators(), plant.num_constraints()) == (0, 0)
+    text = PINCER_SDF.replace("</limit>", "<effort>3</effort></limit>")
+    plant = MultibodyPlant(0.01)
+    add_model(plant, load_hand(write_pincer(tmp_path, text)).model)
+    assert plant.num_actuators() == 0

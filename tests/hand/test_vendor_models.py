@@ -77,7 +77,6 @@ def test_limits_that_bar_the_way_of_a_mimic_are_refused(tmp_path: Path) -> None:
 MOTOR = '<motor joint="left_slide" forcerange="-60 60"/>'
 JOINT = '<joint name="left_slide"'
 LINE = 'polycoef="0 1 0 0 0"'
-LEFT = JAWS_MJCF[JAWS_MJCF.index('<body name="left') : JAWS_MJCF.index('<body name="right')]
 
 
 @pytest.mark.parametrize(
@@ -88,26 +87,11 @@ LEFT = JAWS_MJCF[JAWS_MJCF.index('<body name="left') : JAWS_MJCF.index('<body na
         ({MOTOR: '<position joint="left_slide" kp="9" ctrlrange="0 0.05"/>'}, 0.0, 1.0),
         ({JOINT: f'{JOINT} actuatorfrcrange="-8 8"'}, 8.0, 1.0),
         ({JOINT: f'{JOINT} actuatorfrcrange="-8 8" actuatorfrclimited="false"'}, 60.0, 1.0),
-        ({JOINT: f'{JOINT} ref="0.01"'}, 60.0, 1.0),
         ({LINE: 'active="false"'}, 60.0, None),
-        ({LINE: 'polycoef="0"'}, 60.0, 1.0),
         ({JOINT: f'{JOINT} ref="0.01"', LINE: 'polycoef="0 0.5"'}, 60.0, 0.5),
-        ({LINE: 'polycoef="0 0.5"'}, 60.0, 0.5),
-        ({LEFT: f'<frame pos="0 0.01 0"><frame euler="0 0 90">{LEFT}</frame></frame>'}, 60.0, 1.0),
-        ({LEFT: f'{LEFT}<frame pos="0 0 -0.03"><geom size="0.01" mass="0.2"/></frame>'}, 60.0, 1.0),
-        ({"<worldbody>": "<worldbody><frame>", "</worldbody>": "</frame></worldbody>"}, 60.0, 1.0),
         ({JOINT: f'{JOINT} pos="0.01 0.02 0.03"'}, 60.0, 1.0),
         ({LINE: 'active="false"', MOTOR: '<motor joint="left_slide" gear="3"/>'}, 0.0, None),
         ({MOTOR: f'{MOTOR}<motor joint="left_slide" gear="2" forcerange="-5 5"/>'}, 70.0, 1.0),
-        (
-            {
-                LEFT: LEFT.replace("<joint ", "<frame><joint ").replace(
-                    '.05"/>', '.05"/></frame>', 1
-                )
-            },
-            60.0,
-            1.0,
-        ),
     ],
 )
 def test_mjcf_is_read_as_mujoco_compiles_it(
@@ -193,8 +177,6 @@ TIP = '<geom type="box" size="0.01 0.006 0.03" pos="0 0.006 0.03"'
     ("changes", "low", "high"),
     [
         ({TIP: '<geom type="box" size=".01" fromto="0 0 0 0 0 .06"'}, (-10, -10, 0), (10, 10, 60)),
-        ({TIP: '<geom type="ellipsoid" size=".01" fromto="0 0 0 0 0 .06"'},
-         (-10, -10, 0), (10, 10, 60)),
         ({TIP: '<geom type="capsule" size=".01" fromto="0 0 0 .06 0 0"'},
          (-10, -10, -10), (70, 10, 10)),
         ({TIP: '<geom type="cylinder" size=".01" fromto="0 0 0 0 .06 0"'},
@@ -202,15 +184,8 @@ TIP = '<geom type="box" size="0.01 0.006 0.03" pos="0 0.006 0.03"'
         ({TIP: '<geom type="sphere" size=".01" pos="0 0 .05"'}, (-10, -10, 40), (10, 10, 60)),
         ({TIP: '<geom type="ellipsoid" size=".01 .02 .03"'}, (-10, -20, -30), (10, 20, 30)),
         (mesh_tip(f'vertex="{PLATE}"'), (0, 0, 0), (20, 12, 60)),
-        (mesh_tip(f'vertex="{PLATE}" scale="2 1 1"'), (0, 0, 0), (40, 12, 60)),
         (mesh_tip('file="jaw.stl" refpos="0 0 0.01"'), (-10, -6, -40), (10, 6, 20)),
         (mesh_tip('file="jaw.obj" refquat="1 1 0 0"'), (-10, -30, -6), (10, 30, 6)),
-        (mesh_tip('file="jaw.glb"'), (-10, -6, -30), (10, 6, 30)),
-        (mesh_tip('builtin="cone" params="64 1" scale=".01 .01 .03"'),
-         (-10, -10, -30), (10, 10, 30)),
-        ({TIP: TIP.replace("size=", 'class="wide" size='), "<worldbody>":
-          '<default><default class="wide"><geom euler="90 0 0"/></default></default><worldbody>'},
-         (-10, -24, 24), (10, 36, 36)),
     ],
 )  # fmt: skip
 def test_shapes_of_mjcf_are_those_that_mujoco_compiles(
@@ -218,7 +193,7 @@ def test_shapes_of_mjcf_are_those_that_mujoco_compiles(
 ) -> None:
     """Bounds in [mm]; the mass stays."""
     pytest.importorskip("mujoco")
-    for suffix in ("stl", "obj", "glb"):
+    for suffix in ("stl", "obj"):
         write_mesh(tmp_path / f"jaw.{suffix}")
     text = JAWS_MJCF
     for old, new in changes.items():
@@ -281,28 +256,6 @@ def test_an_inertia_that_no_body_has_is_replaced_and_said(tmp_path: Path, moment
     # A rod is a body.
     rod = JAWS.replace('izz="1e-4"', 'izz="0"')
     assert read_model(write_model(tmp_path / "rod", rod)).notes == ()
-
-
-def test_a_class_of_mjcf_has_what_all_classes_around_it_say(tmp_path: Path) -> None:
-    """Also where one in between says nothing of the tag, and by `childclass` from bodies above."""
-    classes = """<default><joint type="slide"/><default class="jaw">
-      <joint axis="0 1 0" range="0 0.05"/><motor forcerange="-60 60"/>
-      <default class="between"><geom mass="0.05"/>
-        <default class="right"><joint axis="0 -1 0"/></default>
-        <default class="left"><joint damping="1"/></default></default></default></default>"""
-    text = JAWS_MJCF.replace("<worldbody>", f"{classes}<worldbody>")
-    text = text.replace('<body name="body">', '<body name="body" childclass="left">')
-    text = text.replace('type="slide" axis="0 1 0" range="0 0.05"', "")
-    text = text.replace('type="slide" axis="0 -1 0" range="0 0.05"', 'class="right"')
-    text = text.replace('<motor joint="left_slide" forcerange="-60 60"/>',
-                        '<motor joint="left_slide" class="right"/>')  # fmt: skip
-    assert text.count("range=") == 2
-    plain = read_model(write_model(tmp_path, JAWS_MJCF, "plain.xml"))
-    for name, joint in read_model(write_model(tmp_path, text, "hand.xml")).joints.items():
-        assert joint.slides
-        np.testing.assert_allclose(joint.axis, plain.joints[name].axis)
-        np.testing.assert_allclose(joint.limits, plain.joints[name].limits)
-        assert joint.effort == plain.joints[name].effort
 
 
 @pytest.mark.parametrize("case", [*READ, *REFUSED])

@@ -101,21 +101,11 @@ SLIDER = """<robot name="slider">
 
 def write_slider(folder: Path, urdf: str = SLIDER, **changes: object) -> Path:
     """Write the gripper that slides, the YAML with changes, and return the YAML's path."""
-    fingers = [
-        {
-            "name": side,
-            "fingertip": side,
-            "closing_joint": f"{side}_slide",
-            "force_limit": 20.0,
-            "pad_point": [0.0, 0.0, 0.09],
-        }
-        for side in ("left", "right")
-    ]
     described: dict[str, Any] = {
         "version": 1,
         "model": "slider.urdf",
         "palm": {"link": "palm", "p_BG": [0.0, 0.0, 0.01]},
-        "fingers": fingers,
+        "fingers": slider_fingers(20.0),
         "closing_speed": 0.1,
         "standoffs": [0.02],
     }
