@@ -21,6 +21,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
+from drakegrasp.simulation.attempt import usual_materials
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import (
     disengage,
@@ -198,9 +199,9 @@ def test_lift_leaves_the_hand_as_it_was(
         lower = [float(joint.position_lower_limits()[0]) for joint in scene.closing_joints]
         return [*lower, *(motor.effort_limit() for motor in scene.motors)]
 
-    before = limits()
+    before, materials = limits(), usual_materials(cube, config.physics)
     _closed_on(scene, cube)
-    lifting.lift(scene, start_limits(config), config)
+    lifting.lift(scene, start_limits(config), config, materials)
     assert limits() == before
 
     def too_late(*_: object) -> None:
@@ -209,7 +210,7 @@ def test_lift_leaves_the_hand_as_it_was(
     monkeypatch.setattr(lifting._Monitor, "update", too_late)
     _closed_on(scene, cube)
     with pytest.raises(TrialTimeout):
-        lifting.lift(scene, start_limits(config), config)
+        lifting.lift(scene, start_limits(config), config, materials)
     assert limits() == before
     assert scene.simulator.get_monitor() is None
 
@@ -219,7 +220,7 @@ def test_lift_leaves_the_hand_as_it_was(
     monkeypatch.setattr(drive_module, "opening_torques", fail)
     _closed_on(scene, cube)
     with pytest.raises(RuntimeError, match="no solution"):
-        lifting.lift(scene, start_limits(config), config)
+        lifting.lift(scene, start_limits(config), config, materials)
     assert limits() == before
 
 
@@ -227,7 +228,7 @@ def test_lift_leaves_the_hand_as_it_was(
 def test_lift_cut_off_in_coarse_steps_leaves_their_scene_as_it_was(
     scene: Scene, cube: ObjectModel, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    coarse = scene.coarse_scene()
+    coarse, materials = scene.coarse_scene(), usual_materials(cube, config.physics)
     hand = coarse.hand
     updates = []
 
@@ -241,7 +242,7 @@ def test_lift_cut_off_in_coarse_steps_leaves_their_scene_as_it_was(
     monkeypatch.setattr(lifting._Monitor, "update", rest_then_fail)
     _closed_on(scene, cube)
     with pytest.raises(TrialTimeout):
-        lifting.lift(scene, start_limits(config), config)
+        lifting.lift(scene, start_limits(config), config, materials)
     assert updates == [scene, coarse]
     lower = [float(joint.position_lower_limits()[0]) for joint in coarse.closing_joints]
     assert lower == [limits[0] for limits in coarse.closing_limits]
