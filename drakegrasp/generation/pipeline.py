@@ -244,7 +244,7 @@ class _Build:
         if self._pool is not None:
             sweep_temporary(self._out)
 
-        assembled = self._assemble()
+        assembled, assembly = self._assemble()
         if counts.damaged:
             shards = f"{counted(len(counts.damaged), 'shard')} ({listed(counts.damaged)})"
             self._notices.append(f"{shards}: damaged, and simulated again")
@@ -261,7 +261,7 @@ class _Build:
             notices=tuple(self._notices),
             unexplained=unexplained,
             assembled=assembled,
-            assembly=summarise(self._out),
+            assembly=assembly,
         )
 
     def _say(self, text: str) -> None:
@@ -463,21 +463,19 @@ class _Build:
 
     # Files
 
-    def _assemble(self) -> bool:
+    def _assemble(self) -> tuple[bool, Assembly]:
         """Assemble the shards, unless the assembled files already have exactly these shards.
 
         Returns:
-            Whether the files were written.
+            Whether the files were written, and their content.
         """
-        out = self._out
-        stale = not is_assembled(out, verify_shards=True)
-        if stale:
-            with self._progress("assemble", "shards") as report:
-                known, surveyed = self._successes or None, self._survey
-                assemble_locked(
-                    out, self._manifest, known=known, surveyed=surveyed, progress=report
-                )
-        return stale
+        out, known = self._out, self._successes or None
+        if is_assembled(out, verify_shards=True):
+            return False, summarise(out)
+        with self._progress("assemble", "shards") as report:
+            return True, assemble_locked(
+                out, self._manifest, known=known, surveyed=self._survey, progress=report
+            )
 
 
 def _set_units(target: Target, manifest: Manifest) -> None:

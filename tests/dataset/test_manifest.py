@@ -24,53 +24,17 @@ from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.errors import DataError
 from drakegrasp.hand.settings import load_config
 
-#: The end of a manifest as builds have always written it.
-ENTRIES = """ "objects": [
-  {
-   "name": "1_mug_é",
-   "class": "mug",
-   "mesh_sha256": "ab",
-   "scale": 1.0,
-   "up": "+z",
-   "mass": 0.1,
-   "density": 1000.0,
-   "friction": null,
-   "collision_error": 0.0,
-   "resting": [
-    {
-     "X_TO": [
-      1.0,
-      0.0,
-      0.0,
-      0.30000000000000004,
-      0.0,
-      1.0,
-      0.0,
-      -0.0,
-      0.0,
-      0.0,
-      1.0,
-      1e-17
-     ],
-     "probability": 0.75,
-     "rolled": true
-    }
-   ],
-   "candidates": 7,
-   "notes": [
-    "2 holes closed"
-   ]
-  }
- ],
- "refused": [
-  {
-   "name": "2_sheet",
-   "mesh_sha256": "cd",
-   "reason": "must be closed"
-  }
- ]
+#: What builds have always written of these entries, in this order.
+X_TO = (1.0, 0.0, 0.0, 0.30000000000000004, 0.0, 1.0, 0.0, -0.0, 0.0, 0.0, 1.0, 1e-17)
+RESTING = {"X_TO": X_TO, "probability": 0.75, "rolled": True}
+ENTRIES = {
+    "objects": [
+        {"name": "1_mug_é", "class": "mug", "mesh_sha256": "ab", "scale": 1.0, "up": "+z"}
+        | {"mass": 0.1, "density": 1000.0, "friction": None, "collision_error": 0.0}
+        | {"resting": [RESTING], "candidates": 7, "notes": ["2 holes closed"]}
+    ],
+    "refused": [{"name": "2_sheet", "mesh_sha256": "cd", "reason": "must be closed"}],
 }
-"""
 
 MUG = ObjectEntry(
     name="1_mug_é",
@@ -82,13 +46,7 @@ MUG = ObjectEntry(
     density=1000.0,
     friction=None,
     collision_error=0.0,
-    resting=(
-        RestingEntry(
-            X_TO=(1.0, 0.0, 0.0, 0.1 + 0.2, 0.0, 1.0, 0.0, -0.0, 0.0, 0.0, 1.0, 1e-17),
-            probability=0.75,
-            rolled=True,
-        ),
-    ),
+    resting=(RestingEntry(X_TO=X_TO, probability=0.75, rolled=True),),
     candidates=7,
     notes=("2 holes closed",),
 )
@@ -104,7 +62,8 @@ def manifest() -> Manifest:
 def test_entries_are_written_as_ever(tmp_path: Path, manifest: Manifest) -> None:
     write_manifest(manifest, tmp_path)
     text = (tmp_path / FILE_NAME).read_text(encoding="utf-8")
-    assert text.split(f',\n "{DIGEST}"')[0].endswith(ENTRIES.removesuffix("\n}\n"))
+    entries = json.dumps(ENTRIES, indent=1, ensure_ascii=False)
+    assert text.split(f',\n "{DIGEST}"')[0].endswith(entries.strip("{}\n"))
 
 
 def test_manifest_that_is_read_and_written_keeps_its_bytes(

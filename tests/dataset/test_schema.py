@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
-from types import NoneType
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -20,23 +18,18 @@ from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
-    ROBUST_FIELDS,
     SCHEMA_VERSION,
     TRIAL_FIELDS,
     VERIFICATION_FIELDS,
     Field,
     sizes,
 )
-from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import DataError
-from drakegrasp.generation.attempts import TrialRow
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Stage
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.table import Table
-from drakegrasp.verification.result import Verification
 
 SIZES = sizes(fingers=3, joints=4, image=8)
 
@@ -78,42 +71,6 @@ def test_stage_of_a_field_is_that_of_its_measurement(table: tuple[Field, ...]) -
         assert stages == {stage}
     # A hand that closes on a fixed object takes nothing off the table.
     assert "closed_object_on_table" not in {field.name for field in table}
-
-
-def _leads_to_something(root: type, path: str) -> bool:
-    """Return whether a path of attributes is one of a class, by its annotations."""
-    for name in path.split("."):
-        kinds = [k for k in (*get_args(root), root) if k is not NoneType and isinstance(k, type)]
-        if Table in kinds:  # whose columns are no attributes of its class
-            return True
-        hints = [get_type_hints(kind).get(name, getattr(kind, name, None)) for kind in kinds]
-        # A property has the type that it returns.
-        hints = [
-            get_type_hints(getattr(hint, "fget", None) or hint.func)["return"]
-            if isinstance(hint, property | cached_property)
-            else hint
-            for hint in hints
-            if hint is not None
-        ]
-        if not hints:
-            return False
-        (root,) = hints
-    return True
-
-
-@pytest.mark.parametrize(
-    ("root", "field"),
-    [
-        *(
-            (TrialRow, f)
-            for f in TRIAL_FIELDS
-            if f not in ROBUST_FIELDS and f.name not in ASSEMBLED_FIELDS and f.derive is None
-        ),
-        *((Verification, f) for f in VERIFICATION_FIELDS),
-    ],
-)
-def test_field_says_where_its_value_is_measured(root: type, field: Field) -> None:
-    assert _leads_to_something(root, field.of)
 
 
 def test_number_of_a_sample_is_a_column_of_its_trial_in_single_precision() -> None:
