@@ -12,7 +12,6 @@ from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import h5py
 import numpy as np
@@ -34,7 +33,6 @@ import torch
 from assess import assessment, auc
 from batches import centred, object_points, turned
 from fitting import ahead
-from gallery import COLOURS, gallery
 from model_card import card_text
 from networks import (
     ContactNetwork,
@@ -283,7 +281,6 @@ def test_from_scenes_to_predictions(out: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert_assessed(out, scenes)
     assert_described(out, scenes)
-    assert_drawn(out, scenes)
     wrong = script("predict.py", out / "classifier one.pt", scenes, out / "p.h5")
     assert wrong.returncode == 2 and "must be a checkpoint of postures" in wrong.stderr
 
@@ -300,27 +297,6 @@ def assert_assessed(out: Path, scenes: Path) -> None:
     assert found["grasps"] == len(held) == sum(b["grasps"] for b in found["held"]["curve"])
     assert found["held"]["share"] == pytest.approx(held.mean(), abs=1e-4)
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
-
-
-def assert_drawn(out: Path, scenes: Path) -> None:
-    """The gallery has the first prediction of each view, the surest first, samples above."""
-    with h5py.File(out / "p.h5", "r+") as file:
-        ranked = Namespace(of_row=file["row"][:], confidence=file["row"][:] * 7 % 11 / 11.0)
-        file["confidence"][:] = ranked.confidence
-    ranked.rank = np.arange(len(ranked.of_row)) % 2
-    verdicts = [Namespace(counted=row % 3 == 0, outcome="dropped") for row in ranked.of_row]
-    judged = Namespace(ranked=(ranked,), verdicts=(verdicts,))
-    with mock.patch("gallery.judge", return_value=judged):
-        pictures = gallery(out / "p.h5", scenes, out / "card").axes
-    for good, colour in zip((True, False), COLOURS, strict=True):
-        titles = [axes.title for axes in pictures if axes.title.get_color() == colour]
-        said = [float(title.get_text().rsplit(" ", 1)[1]) for title in titles]
-        sure = ranked.confidence[::2][(ranked.of_row[::2] % 3 == 0) == good]
-        assert len(said) > 1
-        assert said == [round(float(each), 2) for each in sorted(sure, reverse=True)][:12]
-    done = script("gallery.py", out / "p.h5", scenes, out / "card", out / "gallery.png")
-    assert done.returncode == 0, done.stderr
-    assert (out / "gallery.png").read_bytes().startswith(b"\x89PNG")
 
 
 def assert_described(out: Path, scenes: Path) -> None:

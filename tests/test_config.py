@@ -122,18 +122,11 @@ def test_empty_mapping_and_empty_file_are_the_defaults(tmp_path: Path) -> None:
     assert load_config(write(tmp_path, "# nothing but a comment\n")) == load_config()
 
 
-def test_one_of_everything_misses_no_field() -> None:
+def test_one_of_everything_has_every_field_none_at_its_default_and_arrives_as_written() -> None:
     assert set(EVERYTHING) == set(fields(Config))
-
-
-def test_one_of_everything_has_no_default() -> None:
     same = [key for key, value in EVERYTHING.items() if value == DEFAULT_VALUES.get(key)]
     assert same == ["lift.stop_when"]
-
-
-def test_one_of_everything_arrives_as_written() -> None:
-    config = load_config(ONE_OF_EVERYTHING)
-    assert dict(leaves(config.to_dict())) == EVERYTHING
+    assert dict(leaves(load_config(ONE_OF_EVERYTHING).to_dict())) == EVERYTHING
 
 
 def test_resolved_values_load_again_to_the_same() -> None:
@@ -204,8 +197,6 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("objects.weight=1", r"objects\.weight: must be a known key \(.*\bmass\b.*\), got an unk"),
         ("camara.size=64", r"camara: must be a known key \(.*\bcamera\b.*\), got an unknown one"),
         ("objects.mass=heavy", r"objects\.mass: must be a valid number.*, got 'heavy'"),
-        ("objects.mass=null", r"objects\.mass: must be a valid number, got None"),
-        ("objects.mass=-1", r"objects\.mass: must be greater than 0, got -1"),
         ("objects.mass=0", r"objects\.mass: must be greater than 0, got 0"),
         ("objects.mass=.nan", r"objects\.mass: must be a finite number, got nan"),
         ("objects.min_diagonal=3", r"objects: min_diagonal must be less than .*, got 3\.0 and 2\."),
@@ -217,30 +208,25 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("physics.time_step=0.1", r"physics\.time_step: must be less than .* 0\.02, got 0\.1"),
         ("lift.drive=gear", r"drive: must be 'worm', 'torque' or 'locked', got 'gear'"),
         ("objects.mass=true", r"objects\.mass: must be .*, got True"),
-        ("seed=yes", r"seed: must be .*, got True"),
         ("lift.p_TG=[0, 0, .nan]", r"must be a finite number, got nan"),
         ("filters.min_camera_height=.nan", r"must be a finite number, got nan"),
         ("seed=1.5", r"seed: must be a valid integer.*, got 1\.5"),
         ("seed=-1", r"seed: must be greater than or equal to 0, got -1"),
         ("hand=3", r"hand: must be a valid string, got 3"),
         ("samples=0", r"samples: must be greater than or equal to 1, got 0"),
-        ("camera=3", r"camera: must be .*, got 3"),
         ("camera.near=0.75", r"camera: near must be less than far, got 0\.75 and 0\.75"),
-        ("camera.far=0.001", r"camera: near must be less than far, got 0\.01 and 0\.001"),
         ("camera.fov_y_deg=180", r"camera\.fov_y_deg: must be less than 180, got 180"),
         ("camera.size.width=3", r"camera\.size: must be a valid integer, got \{'width': 3\}"),
         ("candidates.standoffs=[]", r"candidates\.standoffs: must be a list of at least 1, got \["),
         ("candidates.standoffs=[60]", r"^candidates\.standoffs\.0: must be at most 1 m, got 60 m$"),
         ("candidates.standoffs=[0.1, -1]", r"standoffs\.1: must be greater than 0, got -1"),
         ("candidates.global_x_deg=[.inf]", r"global_x_deg\.0: must be a finite number, got inf"),
-        ("candidates.spreads_deg=[.nan]", r"candidates\.spreads_deg\.0: must be .*, got nan"),
         ("randomize.mass=[2, 1]", r"randomize\.mass: must be a range, low .*, got \[2\.0, 1\.0\]"),
         ("randomize.mass=[0, 1]", r"randomize\.mass\.0: must be greater than 0, got 0"),
         ("randomize.mass=1", r"randomize\.mass: must be a list, got 1"),
         ("randomize.table_colour=2", r"table_colour: must be less than or equal to 1, got 2"),
         ("randomize.light_angle_deg=70", r"light_angle_deg: must be .* equal to 60, got 70"),
         ("lift.p_TG=[0, 0]", r"lift\.p_TG.*: must be .*, got \[0, 0\]"),
-        ("lift.p_TG=[0, 0, 0, 1]", r"lift\.p_TG: must be .*, got \[0, 0, 0, 1\]"),
         ("split.valid_fraction=1", r"split\.valid_fraction: must be less than 1, got 1"),
         ("split.train_classes=mug", r"split\.train_classes: must be .*, got 'mug'"),
         ("seed", r"--set must be KEY=VALUE with dots between keys, got 'seed'"),
@@ -260,9 +246,7 @@ def test_mistake_is_refused_with_key_demand_and_value(override: str, message: st
     ("text", "message"),
     [
         ("- a\n- b\n", r"config\.yaml: must be a mapping of keys to values, got list"),
-        ("just words\n", r"config\.yaml: must be a mapping of keys to values, got str"),
         ("a: [1\n", r"config\.yaml: must be YAML, got text that is not"),
-        ("camera: {size: 64\n", r"config\.yaml: must be YAML, got text that is not"),
         ("camera: 5\n", r"camera: must be .*, got 5"),
         ("cameras: {size: 64}\n", r"cameras: must be a known key .*, got an unknown one"),
         ("1: 2\n", r"1: must be .*, got 1"),
@@ -290,13 +274,6 @@ def test_all_mistakes_are_told_at_once() -> None:
 def test_override_into_a_value_of_the_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"camera\.size: camera must be a section, got the val"):
         load_config(write(tmp_path, "camera: 5\n"), ["camera.size=64"])
-
-
-def test_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "config.yaml"
-    path.write_bytes(b"hand: \xff\xfe")
-    with pytest.raises(ConfigError, match=r"config\.yaml: must be"):
-        load_config(path)
 
 
 def test_configuration_is_inert() -> None:

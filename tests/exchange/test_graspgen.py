@@ -104,13 +104,7 @@ def test_a_verdict_ranks_by_object_and_by_row(out: Path, tmp_path: Path) -> None
     assert rows is None
     assert [grasp.rank for grasp in placed] == [1, 0]
 
-    # A mesh of half the size is another object.
-    write(path, {names[0]: [0.2, 0.9]})
-    with pytest.raises(GraspError, match=rf"a\.h5: scale must be that of {names[0]}, .*got 0.5"):
-        place(path, Target(**where))
-
     # As a score has them: both grasps on each row of their object.
-    write(path, {names[0]: [0.2, 0.9]}, scale=1.0)
     placed, _, rows = place(path, Target(**where, split="train"))
     assert rows is not None
     own = [row for row, name in enumerate(names) if name == names[0]]

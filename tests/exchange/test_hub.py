@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -35,28 +33,6 @@ from drakegrasp.generation.scenes import make_scenes
 
 pq = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("datasets")
-
-#: What `datasets` says of a folder, in a process of its own: it loads half of the packages of the
-#: environment, whose warnings are not ours.
-LOADER = """
-import json, sys
-import datasets, numpy as np
-folder, cache = sys.argv[1:]
-found = {}
-for config in datasets.get_dataset_config_names(folder):
-    for split, rows in datasets.load_dataset(folder, config, cache_dir=cache).items():
-        streamed = datasets.load_dataset(folder, config, streaming=True)[split]
-        found[f"{config}/{split}"] = {
-            "trial_id": rows["trial_id"][:] if "trial_id" in rows.features else [],
-            "scene": [row["scene"] for row in streamed] if "scene" in rows.features else [],
-            "streamed": [row.get("trial_id") for row in streamed],
-            "pixels": [
-                [np.asarray(row[name]).tolist() for name in ("image", "depth", "mask")]
-                for row in rows
-            ] if config == "oto" else [],
-        }
-print(json.dumps(found))
-"""
 
 
 @pytest.fixture(scope="module")
@@ -135,32 +111,6 @@ def test_rows_of_scenes_are_those_of_their_file(
                     value = row["image" if field.name == "rgb" else field.name]
                     value = pixels_of(value) if field.sample else value
                     np.testing.assert_array_equal(value, own[field.name][i], err_msg=field.name)
-
-
-@pytest.mark.sim
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_datasets_loads_what_the_files_hold(with_scenes: Path, tmp_path: Path) -> None:
-    process = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", LOADER, str(with_scenes), str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={"PATH": "", "HOME": str(tmp_path), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)},
-    )
-    assert process.returncode == 0, process.stderr
-    found = json.loads(process.stdout.splitlines()[-1])
-    assert {name.partition("/")[0] for name in found} == {"oto", "otm", "views", "scene_grasps"}
-    for name, said in found.items():
-        rows = table_of(with_scenes, *name.split("/"))
-        assert len(said["streamed"]) == len(rows)
-        if "trial_id" in rows[0]:
-            assert said["trial_id"] == said["streamed"] == [row["trial_id"] for row in rows]
-        for pixels, row in zip(said["pixels"], rows, strict=False):
-            for values, image in zip(pixels, ("image", "depth", "mask"), strict=True):
-                np.testing.assert_array_equal(values, pixels_of(row[image]))
-        if "scene" in rows[0]:
-            assert said["scene"] == [row["scene"] for row in rows]
 
 
 def test_card_names_licence_files_and_samples(dataset: Path, folder: Path) -> None:

@@ -18,7 +18,7 @@ from drakegrasp.errors import GraspError
 from drakegrasp.exchange import columns as columns_of_files
 from drakegrasp.exchange.attempts import holds_postures, read_attempts, write_attempts
 from drakegrasp.frames import make_pose, rotation_about
-from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.simulation.attempts import CONDITIONS, Attempts, quaternion_poses, ranked
 from drakegrasp.simulation.posture import joint_order
@@ -58,12 +58,18 @@ def write_npz(folder: Path) -> Path:
     return folder / "p.npz"
 
 
-def write_hdf5(folder: Path) -> Path:
+def write_hdf5(folder: Path, content: dict[str, Any] | None = None) -> Path:
     with h5py.File(folder / "p.h5", "w") as file:
-        for name, value in arrays().items():
-            text = value.dtype.kind == "U"
-            file.create_dataset(name, data=value.astype(object) if text else value)
+        for name, value in (content or arrays()).items():
+            array = np.asarray(value)
+            file[name] = array.astype(object) if array.dtype.kind == "U" else array
     return folder / "p.h5"
+
+
+def read_own(folder: Path, hand: Hand, **content: Any) -> Attempts:
+    """Return the postures of a file of arrays, p.npz."""
+    np.savez(folder / "p.npz", **content)
+    return read_attempts(folder / "p.npz", hand)
 
 
 def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path):
@@ -72,8 +78,7 @@ def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path):
     tripod = hand.at(hand.preshape_names.index("tripod"))
     joints = [f.closing_joint for f in tripod.fingers]
     rows = {"object": OBJECTS, "X_FG": [np.eye(4)] * 2, "preshape": ["tripod"] * 2}
-    np.savez(tmp_path / "p.npz", **rows, q_grasp=[[0.1, 0.2, 0.3]] * 2, joints=joints)
-    table = read_attempts(tmp_path / "p.npz", hand)
+    table = read_own(tmp_path, hand, **rows, q_grasp=[[0.1, 0.2, 0.3]] * 2, joints=joints)
     assert table.preshape == ("tripod", "tripod")
     expected = joint_positions(tripod, 0.0, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(table.q_grasp[1], [expected[name] for name in joint_order(hand)])
@@ -81,11 +86,9 @@ def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path):
 
 def test_a_row_of_a_preshape_that_the_hand_lacks_spoils_no_other(tmp_path):
     hand = load_hand("allegro_four")
-    path, known = tmp_path / "p.npz", hand.preshape_names[0]
-    q = np.zeros((3, len(joint_order(hand))))
-    names = ["mug"] * 3
-    np.savez(path, object=names, X_FG=[np.eye(4)] * 3, q_grasp=q, preshape=[known, "fist", ""])
-    table = read_attempts(path, hand)
+    known, q = hand.preshape_names[0], np.zeros((3, len(joint_order(hand))))
+    rows = {"object": ["mug"] * 3, "X_FG": [np.eye(4)] * 3, "preshape": [known, "fist", ""]}
+    table = read_own(tmp_path, hand, **rows, q_grasp=q)
     assert table.preshape == (known, "fist", "")
     assert [bool(reason) for reason in table.invalid] == [False, True, False]
     assert f"preshape must be one of {known}" in table.invalid[1] and "'fist'" in table.invalid[1]
@@ -131,30 +134,22 @@ def test_all_that_is_known_is_written(tmp_path):
 
 
 def test_pose_of_the_palm_link_becomes_that_of_the_palm(tmp_path):
-    np.savez(tmp_path / "p.npz", **arrays(), link=np.array(HAND.palm_link))
-    table = read_attempts(tmp_path / "p.npz", HAND)
+    table = read_own(tmp_path, HAND, **arrays(), link=np.array(HAND.palm_link))
     np.testing.assert_allclose(table.X_FG, POSES @ HAND.X_BG, atol=1e-12)
 
 
 def test_joints_that_the_hand_file_moves_may_be_left_out(tmp_path):
     named = ("index_mcp_joint", "middle_mcp_joint", "thumb_mcp_joint")
-    np.savez(
-        tmp_path / "p.npz",
-        object=np.array(["mug"]),
-        X_FG=POSES[:1],
-        q_grasp=np.array([[0.5, 0.6, 0.7]]),
-        joints=np.array(named),
-    )
-    q = dict(zip(ORDER, read_attempts(tmp_path / "p.npz", HAND).q_grasp[0], strict=True))
+    rows = {"object": ["mug"], "X_FG": POSES[:1], "q_grasp": [[0.5, 0.6, 0.7]], "joints": named}
+    q = dict(zip(ORDER, read_own(tmp_path, HAND, **rows).q_grasp[0], strict=True))
     assert q["index_pip_joint"] == pytest.approx(0.7)
     assert q["thumb_ip_joint"] == pytest.approx(0.175)
     assert q["thumb_opposition_joint"] == HAND.preshape["thumb_opposition_joint"]
 
 
 def test_degrees_are_refused_and_one_wild_row_is_not(tmp_path):
-    np.savez(tmp_path / "p.npz", **{**arrays(), "q_grasp": np.rad2deg(GRASP + 1.0)})
     with pytest.raises(GraspError, match=r"grasp joints must be in radians, .* look like degrees"):
-        read_attempts(tmp_path / "p.npz", HAND)
+        read_own(tmp_path, HAND, **{**arrays(), "q_grasp": np.rad2deg(GRASP + 1.0)})
 
     wild = np.concatenate([GRASP, GRASP[:1]])
     wild[0, 0] = 50.0
@@ -314,29 +309,15 @@ def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
 # Palm poses alone
 
 
-def write_palms(folder: Path, form: str, poses: np.ndarray = POSES) -> Path:
+def write_palms(folder: Path, form: str) -> Path:
     """Palm poses without joints, of the mug, in any layout."""
-    path = folder / f"mug.{form}"
-    content = {"object": ["mug"] * len(poses), "X_FG": poses}
-    if form == "npz":
-        np.savez(path, **content)
-    elif form == "h5":
-        with h5py.File(path, "w") as file:
-            for name, value in content.items():
-                file[name] = value
-    else:
-        # As `save_to_isaac_grasp_format` of GraspGen writes it.
-        grasps = {
-            f"grasp_{i}": {
-                "confidence": 0.5 + 0.1 * i,
-                "position": X[:3, 3].tolist(),
-                "orientation": {"w": float(quaternion(X)[0]), "xyz": quaternion(X)[1:].tolist()},
-            }
-            for i, X in enumerate(poses)
-        }
-        tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": grasps}
-        path.write_text(yaml.dump(tree, default_flow_style=False, sort_keys=False))
-    return path
+    content = {"object": ["mug"] * len(POSES), "X_FG": POSES}
+    if form == "h5":
+        return write_hdf5(folder, content)
+    if form == "yaml":
+        return write_isaac(folder / "mug.yaml", a=isaac_grasp(POSES[0]), b=isaac_grasp(POSES[1]))
+    np.savez(folder / "p.npz", **content)
+    return folder / "p.npz"
 
 
 @pytest.mark.parametrize("form", ["npz", "h5", "yaml"])
@@ -354,17 +335,14 @@ def test_a_palm_pose_in_each_preshape_has_no_joints(tmp_path):
     hand = load_hand("allegro_four")
     q = np.zeros((1, len(joint_order(hand))))
     content = {"object": ["mug"], "X_FG": POSES[:1], "preshape": ["each"]}
-    np.savez(tmp_path / "p.npz", **content)
-    table = read_attempts(tmp_path / "p.npz", hand)
+    table = read_own(tmp_path, hand, **content)
     assert table.invalid == ("",) and table.shapes(0, hand) == hand.preshape_names
     assert "preshape must be left out" in read_attempts(tmp_path / "p.npz", HAND).invalid[0]
-    np.savez(tmp_path / "p.npz", **content, q_grasp=q)
-    assert "preshape must be one of" in read_attempts(tmp_path / "p.npz", hand).invalid[0]
+    assert "preshape must be one of" in read_own(tmp_path, hand, **content, q_grasp=q).invalid[0]
 
 
 def test_joints_before_a_grasp_without_joints_are_refused(tmp_path):
-    np.savez(tmp_path / "p.npz", object=OBJECTS, X_FG=POSES, q_pregrasp=PREGRASP)
-    reasons = read_attempts(tmp_path / "p.npz", HAND).invalid
+    reasons = read_own(tmp_path, HAND, object=OBJECTS, X_FG=POSES, q_pregrasp=PREGRASP).invalid
     assert all("q_pregrasp must be given together with q_grasp" in reason for reason in reasons)
 
 
@@ -384,8 +362,7 @@ def test_bad_row_of_arrays_has_its_reason_and_spoils_no_other(tmp_path, changes,
     for name, value in changes.items():
         factor = np.reshape(value, (2, *[1] * (content[name].ndim - 1)))
         content[name] = content[name] * factor if isinstance(value, list) else value
-    np.savez(tmp_path / "p.npz", **content)
-    table = read_attempts(tmp_path / "p.npz", HAND)
+    table = read_own(tmp_path, HAND, **content)
     assert table.invalid[0].startswith(reason)
     assert table.invalid[1] == ""
     np.testing.assert_array_equal(table.X_FG[1], good.X_FG[1])
@@ -472,12 +449,22 @@ def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
         ({"q_grasp": GRASP.astype(str)}, "grasp joints must be numbers .*, got text"),
         ({"quaternion": np.eye(4)[:2]}, "poses must be X_FG, or position and .*, got both"),
         ({"object": np.zeros(2)}, "object must be texts"),
+        ({"frame": ["table", ""]}, "frame must be the same in all rows"),
+        ({"X_FG": None}, r"X_FG \(or position and .* must"),
+        (
+            {
+                "X_FG": None,
+                "position": np.zeros((2, 3)),
+                "quaternion": [[1, 0, 0, 0], [1, 0, 0, 1j]],
+            },
+            r"position and quaternion must .*, got complex",
+        ),
     ],
 )
 def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, words):
-    np.savez(tmp_path / "p.npz", **{**arrays(), **changes})
+    content = {k: v for k, v in {**arrays(), **changes}.items() if v is not None}
     with pytest.raises(GraspError, match=words) as caught:
-        read_attempts(tmp_path / "p.npz", HAND)
+        read_own(tmp_path, HAND, **content)
     assert str(caught.value).startswith(str(tmp_path / "p.npz"))
     assert "\n" not in str(caught.value)
 
@@ -523,13 +510,6 @@ def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
         read_attempts(tmp_path / name, HAND)
 
 
-def test_quaternions_that_are_complex_are_refused(tmp_path):
-    turns = np.tile([1.0, 0.0, 0.0, 1j], (2, 1))
-    np.savez(tmp_path / "p.npz", object=OBJECTS, position=np.zeros((2, 3)), quaternion=turns)
-    with pytest.raises(GraspError, match=r"position and quaternion must .*, got complex"):
-        read_attempts(tmp_path / "p.npz", HAND)
-
-
 def test_damaged_stream_is_refused_in_a_line(tmp_path):
     """Zlib has an error of its own for what cannot be inflated; one array is no file of several."""
     np.save(tmp_path / "one.npy", GRASP)
@@ -546,18 +526,6 @@ def test_damaged_stream_is_refused_in_a_line(tmp_path):
     ) as caught:
         read_attempts(tmp_path / "a.npz", HAND)
     assert "\n" not in str(caught.value)
-
-
-def test_frame_that_some_rows_lack_is_refused(tmp_path):
-    np.savez(tmp_path / "p.npz", **arrays(), frame=["table", ""])
-    with pytest.raises(GraspError, match="frame must be the same in all rows"):
-        read_attempts(tmp_path / "p.npz", HAND)
-
-
-def test_what_is_missing_is_told(tmp_path):
-    np.savez(tmp_path / "p.npz", joints=np.array(ORDER))
-    with pytest.raises(GraspError, match=r"X_FG \(or position and .* must"):
-        read_attempts(tmp_path / "p.npz", HAND)
 
 
 def test_rows_without_an_object_are_of_the_one_that_is_named(tmp_path):
@@ -590,27 +558,21 @@ def test_samples_that_were_exported_come_back(exported, grasps):
 
 def test_without_a_dataset_rows_are_not_asked_and_confidence_is_one_per_row(tmp_path):
     """Not even how many rows there are: a table of postures can still be cut."""
-    np.savez(tmp_path / "p.npz", **arrays(), row=[0], confidence=[0.5, 0.7])
-    table = read_attempts(tmp_path / "p.npz", HAND)
+    table = read_own(tmp_path, HAND, **arrays(), row=[0], confidence=[0.5, 0.7])
     assert table.of_row is None
     assert table.at([1]).confidence.tolist() == [0.7]
-    np.savez(tmp_path / "p.npz", **arrays(), confidence=0.5)
     with pytest.raises(GraspError, match=r"confidence must be \(2,\) finite .* grasp, got \(\)"):
-        read_attempts(tmp_path / "p.npz", HAND)
+        read_own(tmp_path, HAND, **arrays(), confidence=0.5)
 
 
 @pytest.mark.parametrize("none", [np.nan, np.inf, -np.inf])
 def test_a_confidence_that_is_not_finite_is_refused_unless_its_row_is(tmp_path, none):
     """A row that is no posture spoils no other, whatever its confidence."""
-    path, must = (
-        tmp_path / "p.npz",
-        r"confidence must be \(2,\) finite numbers, one per grasp, got ",
-    )
-    np.savez(path, **arrays(), confidence=[none, 0.7])
-    with pytest.raises(GraspError, match=f"^{path}: {must}{none}"):
-        read_attempts(path, HAND)
-    np.savez(path, **arrays() | {"X_FG": POSES * [[[np.nan]], [[1.0]]]}, confidence=[np.nan, 0.7])
-    table = read_attempts(path, HAND)
+    must = r"confidence must be \(2,\) finite numbers, one per grasp, got "
+    with pytest.raises(GraspError, match=f"^{tmp_path / 'p.npz'}: {must}{none}"):
+        read_own(tmp_path, HAND, **arrays(), confidence=[none, 0.7])
+    rows = arrays() | {"X_FG": POSES * [[[np.nan]], [[1.0]]]}
+    table = read_own(tmp_path, HAND, **rows, confidence=[np.nan, 0.7])
     assert [bool(reason) for reason in table.invalid] == [True, False]
     assert ranked(table, ["mug"] * 2).rank.tolist() == [1, 0]
 

@@ -234,29 +234,21 @@ def test_a_depth_that_means_unknown_is_named_where_it_spoils_the_table(mark):
     assert off(dg.fit_table(np.where(some, mark, depth), K, mask)[0])[0] < 1e-4
 
 
+def camera_of(path):
+    return read_camera(str(path), (HIGH, WIDE))
+
+
 @pytest.mark.parametrize(
     ("read", "content", "said"),
     [
         (read_mask, b"no image", "must be an image, got no image"),
         (lambda path: read_depth_png(path, 0.001), 8, "16 bits and one channel, got uint8"),
+        (camera_of, b"[1, 2]", r"camera must be .*got an array of shape"),
+        (camera_of, b'{"f": 1}', r"camera must be .*got None"),
+        (camera_of, b"{", "a JSON file with K, got: "),
+        (camera_of, b'{"fx": true, "fy": 300, "cx": 80, "cy": 60}', "camera .*, got truth values"),
         (
-            lambda path: read_camera(str(path), (HIGH, WIDE)),
-            b"[1, 2]",
-            r"camera must be .*got an array of shape",
-        ),
-        (
-            lambda path: read_camera(str(path), (HIGH, WIDE)),
-            b'{"f": 1}',
-            r"camera must be .*got None",
-        ),
-        (lambda path: read_camera(str(path), (HIGH, WIDE)), b"{", "a JSON file with K, got: "),
-        (
-            lambda path: read_camera(str(path), (HIGH, WIDE)),
-            b'{"fx": true, "fy": 300, "cx": 80, "cy": 60}',
-            "camera must be .*, got truth values",
-        ),
-        (
-            lambda path: read_camera(str(path), (HIGH, WIDE)),
+            camera_of,
             b'{"K": [1, 0, 80, 0, 1, 60, 0, 0, 1], "d": ["0"]}',
             "d must be numbers, got text",
         ),
