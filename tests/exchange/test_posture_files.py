@@ -389,10 +389,15 @@ def test_grasp_of_isaac_grasp_that_is_none_is_a_row_of_its_own(tmp_path):
     whole = isaac_grasp(np.eye(4), cspace_position=dict.fromkeys(ORDER, 0.1))
     turned = {**whole, "orientation": {"w": 0.0, "xyz": [0.0, 0.0, 0.0]}}
     path = write_isaac(
-        tmp_path / "mug.yaml", a=5, b={**whole, "position": [0.0]}, c=whole, d=turned
+        tmp_path / "mug.yaml",
+        a=5,
+        b={**whole, "position": [0.0]},
+        c=whole,
+        d=turned,
+        palm_alone=isaac_grasp(np.eye(4)),
     )
     table = read_attempts(path, HAND)
-    assert [bool(reason) for reason in table.invalid] == [True, True, False, True]
+    assert [bool(reason) for reason in table.invalid] == [True, True, False, True, False]
     assert table.invalid[1].startswith("b must have position, orientation and cspace_position")
     np.testing.assert_array_equal(table.q_grasp[2], 0.1)
 

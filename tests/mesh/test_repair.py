@@ -1,5 +1,7 @@
 """Truths about meshes: closed forms, seeded faults, refusals; and thirty real files."""
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -39,7 +41,7 @@ VOLUME = float(np.prod(BOX))
 def one_face_turned() -> trimesh.Trimesh:
     mesh = box()
     faces = mesh.faces.copy()
-    faces[3] = faces[3, ::-1]
+    faces[0] = faces[0, ::-1]
     return trimesh.Trimesh(mesh.vertices, faces, process=False)
 
 
@@ -86,15 +88,24 @@ REPAIRED: dict[str, tuple[list[trimesh.Trimesh], float, str]] = {
         1e-3 - 0.08**3 + 0.02**3,
         "1 sealed cavities were kept hollow",
     ),
+    "a hollow body in a hollow one": (
+        [box((0.1,) * 3), flipped(box((0.08,) * 3)), box((0.06,) * 3), flipped(box((0.04,) * 3))],
+        1e-3 - 0.08**3 + 0.06**3 - 0.04**3,
+        "2 sealed cavities were kept hollow",
+    ),
     "a wall in common": ([LEFT, RIGHT], 2e-3, ""),
     "a wall inside": (
         [LEFT, without_faces(RIGHT, RIGHT.face_normals[:, 0] > -0.5)],
         2e-3,
-        "pieces that enclose nothing were dropped",
+        r"\d+ pieces that enclose nothing were dropped",
     ),
     "each face in both directions": ([box(), flipped(box())], VOLUME, ""),
     "a loose triangle": ([box(), SPECK], VOLUME, "1 pieces that enclose nothing were dropped"),
-    "a seam that does not quite meet": ([apart()], VOLUME, "open edges were stitched together"),
+    "a seam that does not quite meet": (
+        [apart()],
+        VOLUME,
+        r"\d+ open edges were stitched together",
+    ),
 }
 
 
@@ -106,7 +117,7 @@ def test_a_surface_becomes_one_solid_and_what_was_done_is_told(tmp_path, case):
     assert model.volume == pytest.approx(volume, rel=1e-3 if "seam" in case else 1e-9)
     inertia = model.visual.moment_inertia / model.volume
     np.testing.assert_allclose(model.I_OOcm_O, inertia, rtol=1e-6, atol=1e-10)
-    assert not note or any(note in each for each in model.notes)
+    assert not note or any(re.match(note, each) for each in model.notes)
 
 
 def test_bodies_that_share_an_edge_are_one_solid(tmp_path):
