@@ -23,6 +23,7 @@ from server.slurm import PARTITION, queued_jobs, running_slurm
 from drakegrasp.cluster import kinds
 from drakegrasp.cluster.connect import WORKER_ENVIRONMENT
 from drakegrasp.cluster.kinds import cluster_of
+from drakegrasp.config import BUILD_PRESET
 from drakegrasp.hand.settings import load_config
 
 pytestmark = [pytest.mark.server, pytest.mark.cluster, pytest.mark.sim, pytest.mark.slow]
@@ -51,7 +52,7 @@ def out(tmp_path: Path) -> Path:
 def built_here(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset, by a plain loop in this process."""
     out = tmp_path_factory.mktemp("here") / "out"
-    config = load_config(overrides=[f"candidates.max={CANDIDATES}", f"unit_candidates={UNIT}"])
+    config = load_config(BUILD_PRESET, [f"candidates.max={CANDIDATES}", f"unit_candidates={UNIT}"])
     build(meshes, out, config)
     return out
 
@@ -83,40 +84,27 @@ def submit(env: dict[str, str], meshes: Path, out: Path, *arguments: str) -> Non
     assert not list(out.parent.parent.rglob("ran"))
 
 
-def settings(client: Client) -> dict[str, dict[str, Any]]:
-    """Return what matters of each worker, as it is there."""
+def check_workers(client: Client, count: int, scheme: str) -> None:
+    """Workers have the settings of this program, as they are there, and those of the user."""
     names = list(WORKER_ENVIRONMENT)
 
     # Workers cannot import this module, so what they run is defined here.
-    def look(dask_worker: Any) -> dict[str, Any]:
+    def look(dask_worker: Any) -> tuple[Any, ...]:
         import os
 
         import dask
 
-        get = dask.config.get
-        return {
-            "environment": {k: os.environ.get(k) for k in names},
-            "start": get("distributed.worker.multiprocessing-method"),
-            "profile": get("distributed.worker.profile.enabled"),
-            "threads": dask_worker.state.nthreads,
-            "yaml": os.environ.get("FROM_YAML"),
-            "address": dask_worker.address,
-        }
-
-    return client.run(look)
-
-
-def check_settings(client: Client, count: int, scheme: str) -> None:
-    found = settings(client)
-    assert len(found) == count
-    for worker in found.values():
-        assert worker["environment"] == WORKER_ENVIRONMENT
-        assert (worker["start"], worker["profile"], worker["threads"]) == ("spawn", False, 1)
-        assert worker["address"].startswith(f"{scheme}://127.0.0.1:")
+        own = {name: os.environ.get(name) for name in names}
+        start = dask.config.get("distributed.worker.multiprocessing-method")
+        profile = dask.config.get("distributed.worker.profile.enabled")
+        return own, start, profile, dask_worker.state.nthreads, os.environ.get("FROM_YAML")
 
     def saturation(dask_scheduler: Any) -> float:
         return float(dask_scheduler.WORKER_SATURATION)
 
+    found = client.run(look)
+    assert list(found.values()) == count * [(WORKER_ENVIRONMENT, "spawn", False, 1, "1")]
+    assert all(address.startswith(f"{scheme}://127.0.0.1:") for address in found)
     assert client.run_on_scheduler(saturation) == 1.0
 
 
@@ -145,20 +133,14 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
         cluster = cluster_of("slurm", workers=3, cores=1, walltime="00:20:00", tls=False)
         client = stack.enter_context(cluster.connected(tmp_path))
         client.wait_for_workers(3, timeout=PATIENCE)
-        check_settings(client, 3, "tcp")
-        for worker in settings(client).values():
-            assert worker["yaml"] == "1"
+        check_workers(client, 3, "tcp")
         before = queued_jobs(slurm)
         subprocess.run(["scancel", before[0]], env=slurm, check=True)
         end = time.monotonic() + PATIENCE
-        while not (len(set(queued_jobs(slurm)) - set(before)) == 1 and workers(client) == 3):
+        while not (len(set(queued_jobs(slurm)) - set(before)) == 1 and len(client.nthreads()) == 3):
             assert time.monotonic() < end, queued_jobs(slurm)
             time.sleep(0.5)
     wait_until(lambda: not queued_jobs(slurm), "the end of the jobs", tmp_path / "none")
-
-
-def workers(client: Client) -> int:
-    return len(client.nthreads())
 
 
 def test_sbatch_file_builds_what_a_plain_loop_builds(
@@ -181,19 +163,3 @@ def test_sbatch_file_builds_what_a_plain_loop_builds(
     assert result.returncode == 0, log.read_text()
     assert_same_dataset(built_here, out)
     assert not list(out.glob(".job-*"))
-
-
-def test_slurm_refuses_a_job_in_one_line(
-    slurm: dict[str, str], meshes: Path, tmp_path: Path
-) -> None:
-    command = [sys.executable, PIPELINES / "submit_build.py", "--objects", meshes]
-    options = ["--out", tmp_path / "out", "--cluster", "slurm", "--workers", "1"]
-    too_much = ["--memory", "9000GB"]
-    result = subprocess.run(
-        [*command, *options, *too_much], env=slurm, capture_output=True, text=True
-    )
-    assert result.returncode == 1
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("error: the workers did not start: ")
-    assert "Requested node configuration is not available" in line or "Memory" in line
-    assert not (tmp_path / "out").exists()
