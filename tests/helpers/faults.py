@@ -9,19 +9,14 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Callable
 
-from drakegrasp.errors import BlankImageError
 from drakegrasp.runtime.journal import VARIABLE
 
 
 def environment(faults: str) -> dict[str, str]:
     """Return the environment of a process in which these faults happen."""
-    return {**os.environ, VARIABLE: setting(faults)}
-
-
-def setting(faults: str) -> str:
-    """Return the value of the variable for these faults."""
-    return f"{os.path.abspath(__file__)};{faults}"
+    return {**os.environ, VARIABLE: f"{os.path.abspath(__file__)};{faults}"}
 
 
 def cause(faults: str, place: str) -> None:
@@ -37,30 +32,34 @@ def happen(kind: str) -> None:
 
     Raises:
         MemoryError: For the kind `memory`.
-        BlankImageError: For the kind `blank`.
+        KeyError: If the kind is not known.
     """
-    # The process ends.
-    if kind == "crash":
-        ctypes.string_at(0)  # a segmentation fault
-    elif kind == "abort":
-        os.abort()
-    elif kind == "exit":
-        os._exit(3)
+    KINDS[kind]()
 
-    # It never returns.
-    elif kind == "hang":
-        while True:  # in C, without the interpreter's lock, like a simulation
-            ctypes.CDLL(None).pause()
-    elif kind == "freeze":
-        ctypes.PyDLL(None).pause()  # in C, with the interpreter's lock
-    elif kind == "spin":
-        while True:  # computes; the others only wait
-            pass
 
-    # An error of Python.
-    elif kind == "memory":
-        raise MemoryError
-    elif kind == "blank":
-        raise BlankImageError("a blank image, by fault injection")
-    else:
-        raise ValueError(f"a fault must be of a known kind, got {kind!r}")
+def hang() -> None:
+    """Never return: in C, without the interpreter's lock, like a simulation."""
+    while True:
+        ctypes.CDLL(None).pause()
+
+
+def spin() -> None:
+    """Never return, and compute."""
+    while True:
+        pass
+
+
+def exhaust() -> None:
+    """Find no memory."""
+    raise MemoryError
+
+
+KINDS: dict[str, Callable[[], object]] = {
+    "crash": lambda: ctypes.string_at(0),  # a segmentation fault
+    "abort": os.abort,
+    "exit": lambda: os._exit(3),
+    "hang": hang,
+    "freeze": lambda: ctypes.PyDLL(None).pause(),  # in C, with the interpreter's lock
+    "spin": spin,
+    "memory": exhaust,
+}
