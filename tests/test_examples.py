@@ -32,18 +32,6 @@ def test_an_example_is_short_and_has_a_picture(example: example_gallery.Example)
     assert (ROOT / "docs" / "images" / example.picture).read_bytes().startswith(b"\x89PNG")
 
 
-def test_numbers_differ() -> None:
-    numbers = [example.number for example in EXAMPLES]
-    assert len(set(numbers)) == len(numbers) >= 5
-
-
-def test_a_docstring_without_concepts_is_refused(tmp_path: Path) -> None:
-    script = tmp_path / "01_nothing.py"
-    script.write_text('"""Do nothing.\n\nOne line.\n"""\n')
-    with pytest.raises(ValueError, match="Concepts"):
-        example_gallery.read_example(script)
-
-
 @pytest.mark.nightly
 @pytest.mark.sim
 @pytest.mark.slow

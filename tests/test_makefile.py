@@ -137,10 +137,3 @@ def test_demo_installs_the_package_and_the_others_what_they_need_beside_it(path:
         (path.parent / "venv" / ".installed-dev").unlink(missing_ok=True)
         assert added(target) == [rest]
         assert added(target) == added("demo") == []
-
-
-def test_help_starts_no_python(path: Path) -> None:
-    for name in ("python3.13", "python3.12", "python3.11", "python3"):
-        program(path, name, f"touch {path.parent}/started; exit 127")
-    assert "make" not in make(path, "help").splitlines()[0]
-    assert not (path.parent / "started").exists()
