@@ -20,10 +20,15 @@ from drakegrasp.page.snapshot import IDENTITY, Snapshot
 ATTACK = "<script>alert(1)</script>"
 
 
+def inspection_of(client: TestClient) -> Inspection:
+    """What an application shows."""
+    found: Inspection = client.app.state.inspection  # type: ignore[attr-defined]
+    return found
+
+
 def state_of(client: TestClient) -> Snapshot:
     """The dataset that an application shows."""
-    found: Snapshot = client.app.state.inspection.snapshot  # type: ignore[attr-defined]
-    return found
+    return inspection_of(client).snapshot
 
 
 def coded(snapshot: Snapshot, text: str) -> str:
@@ -56,9 +61,9 @@ def get(client: TestClient, address: str) -> Any:
     return client.get(coded(state_of(client), address))
 
 
-def open_pages(out: Path) -> TestClient:
-    """Return the application that shows a dataset as it is now."""
-    return TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1:8321")
+def open_pages(out: Path, results: Path | None = None) -> TestClient:
+    """Return the application that shows a dataset, and results for it, as they are now."""
+    return TestClient(make_app(Inspection(out, results)), base_url="http://127.0.0.1:8321")
 
 
 def surface_of(content: bytes | str) -> trimesh.Trimesh:

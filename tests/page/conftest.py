@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import pytest
 from helpers.datasets import TRIALS, make_dataset
-from helpers.pages import ATTACK
+from helpers.pages import ATTACK, open_pages
 from starlette.testclient import TestClient
-
-from drakegrasp.page.app import Inspection, make_app
 
 
 @pytest.fixture(scope="session")
@@ -38,11 +35,5 @@ def hostile(out: Path) -> Path:
 
 
 @pytest.fixture
-def inspection(out: Path) -> Inspection:
-    return Inspection(out)
-
-
-@pytest.fixture
-def client(inspection: Inspection) -> Iterator[TestClient]:
-    with TestClient(make_app(inspection), base_url="http://127.0.0.1:8321") as client:
-        yield client
+def client(out: Path) -> TestClient:
+    return open_pages(out)

@@ -18,22 +18,31 @@ from helpers.datasets import (
     change,
     set_at,
 )
-from helpers.pages import ATTACK, Tags, coded, get, numbered, open_pages, state_of, surface_of
+from helpers.pages import (
+    ATTACK,
+    Tags,
+    coded,
+    get,
+    inspection_of,
+    numbered,
+    open_pages,
+    state_of,
+    surface_of,
+)
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
-from drakegrasp.page.app import HEADERS, TOKEN_HEADER, Inspection, make_app
+from drakegrasp.page.app import HEADERS, TOKEN_HEADER, Inspection
 from drakegrasp.page.gallery import PAGE
 
 PAGES = ("/", "/?outcome=any&page=2", "/grasp/0-0-0", "/grasp/0-0-1")
 
 
 def token(client: TestClient) -> str:
-    inspection: Inspection = client.app.state.inspection  # type: ignore[attr-defined]
-    return inspection.token
+    return inspection_of(client).token
 
 
 def decide(client: TestClient, label: str, decision: str) -> Any:
@@ -229,10 +238,10 @@ def test_pages_ask_nothing_of_other_hosts_and_run_no_script_of_their_own(
 
 @pytest.mark.parametrize("path", ["/", "/grasp/0-0-0", f"/?object={ATTACK}"])
 def test_names_stay_text(hostile: Path, path: str) -> None:
-    with TestClient(make_app(Inspection(hostile)), base_url="http://localhost") as client:
-        page = get(client, path).text
-        assert "<script>alert" not in page
-        assert ATTACK in Tags(page).text
+    client = open_pages(hostile)
+    page = get(client, path).text
+    assert "<script>alert" not in page
+    assert ATTACK in Tags(page).text
 
 
 @pytest.mark.parametrize(
@@ -265,26 +274,24 @@ def test_a_page_names_the_file_of_meshes_that_is_not_there(client: TestClient, o
 def test_pages_say_how_to_take_rejected_grasps_out(boxes: Path, tmp_path: Path, path: str) -> None:
     """The command can be pasted into a shell, whatever the directory is called."""
     out = Path(shutil.copytree(boxes, tmp_path / "my data;x"))
-    with TestClient(make_app(Inspection(out)), base_url="http://localhost") as client:
-        hidden = [a for _, a in Tags(get(client, path).text).tags if a.get("id") == "nextstep"]
-        assert "hidden" in hidden[0]
-        decide(client, "0-0-0", "rejected")
-        page = get(client, path).text
-        shown = [a for _, a in Tags(page).tags if a.get("id") == "nextstep"]
-        assert "hidden" not in shown[0]
-        command = f"drakegrasp assemble '{out}' --reject '{out / 'reject.json'}'"
-        text = " ".join(Tags(page).text.split())
-        assert (
-            f"1 rejected, 1 of them samples now. To take them out of the files: {command}" in text
-        )
-        assert f"drakegrasp replay '{out}' --trial 0" in Tags(get(client, "/grasp/0-0-0").text).text
+    client = open_pages(out)
+    hidden = [a for _, a in Tags(get(client, path).text).tags if a.get("id") == "nextstep"]
+    assert "hidden" in hidden[0]
+    decide(client, "0-0-0", "rejected")
+    page = get(client, path).text
+    shown = [a for _, a in Tags(page).tags if a.get("id") == "nextstep"]
+    assert "hidden" not in shown[0]
+    command = f"drakegrasp assemble '{out}' --reject '{out / 'reject.json'}'"
+    text = " ".join(Tags(page).text.split())
+    assert f"1 rejected, 1 of them samples now. To take them out of the files: {command}" in text
+    assert f"drakegrasp replay '{out}' --trial 0" in Tags(get(client, "/grasp/0-0-0").text).text
 
 
 def test_a_contact_without_a_normal_is_a_reason(out: Path) -> None:
     change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
     client = open_pages(out)
-    card = client.get("/").text.partition("</li>")[0]
-    assert "normal angle: none" in card
+    card = client.get("/?sort=normal_angle").text.partition("</li>")[0]
+    assert 'data-label="0"' in card and "normal angle: none" in card
     parts = get(client, "/grasp/0-0-0").text
     assert re.search(r"<th>normal angle</th><td>none</td>", parts)
 

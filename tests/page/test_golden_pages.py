@@ -10,11 +10,8 @@ from pathlib import Path
 import pytest
 from helpers.datasets import REPEATED, make_dataset
 from helpers.golden import Golden, flat, rounded
-from helpers.pages import get
+from helpers.pages import get, inspection_of, open_pages
 from helpers.predictions import write_predictions
-from starlette.testclient import TestClient
-
-from drakegrasp.page.app import Inspection, make_app
 
 #: Data in a page.
 DATA = re.compile(r'(<script type="application/json"[^>]*>)(.*?)(</script>)', re.DOTALL)
@@ -52,12 +49,11 @@ def repeated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_page(repeated: Path, tmp_path: Path, golden: Golden, name: str, address: str) -> None:
-    inspection = Inspection(repeated, write_predictions(repeated, tmp_path / "run.h5"))
-    with TestClient(make_app(inspection), base_url="http://127.0.0.1:8321") as client:
-        answer = get(client, address)
+    client = open_pages(repeated, write_predictions(repeated, tmp_path / "run.h5"))
+    answer = get(client, address)
     assert answer.status_code == 200
     # The head and the dialogs of all pages are those of the gallery.
     text = answer.text
     if name != "gallery":
         text = "".join(re.findall(r"<script type=.*?</script>|<main.*?</main>", text, re.DOTALL))
-    golden(f"pages/{name}", tags(text, OUT=repeated, TOKEN=inspection.token))
+    golden(f"pages/{name}", tags(text, OUT=repeated, TOKEN=inspection_of(client).token))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,12 @@ import h5py
 import numpy as np
 import pytest
 from helpers.datasets import TRIALS
-from helpers.pages import Tags
+from helpers.pages import Tags, open_pages
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
 from drakegrasp.errors import DataError
-from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.page.app import Inspection
 
 
 @pytest.fixture
@@ -26,10 +26,8 @@ def results(out: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def client(out: Path, results: Path) -> Iterator[TestClient]:
-    app = make_app(Inspection(out, results))
-    with TestClient(app, base_url="http://127.0.0.1:8321") as client:
-        yield client
+def client(out: Path, results: Path) -> TestClient:
+    return open_pages(out, results)
 
 
 def shown(client: TestClient, query: str = "") -> list[str]:
@@ -60,18 +58,6 @@ def test_filters_choose(client: TestClient, query: str, numbers: list[str]) -> N
     assert shown(client, query) == numbers
 
 
-def test_requested_reached_and_true_contacts_are_marked(client: TestClient) -> None:
-    cards = client.get("/predictions?sort=row&order=up").text.split("</li>")
-    card = next(c for c in cards if 'data-label="0"' in c)
-    kinds = {kind: card.count(f'class="{kind}"') for kind in ("requested", "reached", "true")}
-    # Three fingers, in colour and depth.
-    assert kinds == {"requested": 6, "reached": 6, "true": 6}
-    assert "4.0 mm" in card and "it &lt;success&gt;" in card
-    never_closed = next(c for c in cards if 'data-label="2"' in c)
-    assert 'class="reached"' not in never_closed
-    assert never_closed.count('class="requested"') == 6
-
-
 def test_page_of_a_prediction_has_both_hands_and_all_contacts(client: TestClient) -> None:
     page = client.get("/prediction/3?sort=contact_error").text
     assert "2 of 4" in page and "row 1 of train" in page and "dropped" in page
@@ -96,11 +82,10 @@ def test_a_palm_that_never_closed_is_shown_open(out: Path, results: Path) -> Non
         for name in ("p_OQ", "nhat_Q_O"):
             file["grasps"][name][2] = np.nan
         file["grasps/confidence"][:] = [0.3, 0.9, 0.5, 0.1]
-    app = make_app(Inspection(out, results))
-    with TestClient(app, base_url="http://127.0.0.1:8321") as client:
-        assert shown(client, "sort=confidence") == ["1", "2", "0", "3"]
-        states = _scene(client.get("/prediction/2").text)["states"]
-        closed = _scene(client.get("/prediction/3").text)["states"]["closed"]
+    client = open_pages(out, results)
+    assert shown(client, "sort=confidence") == ["1", "2", "0", "3"]
+    states = _scene(client.get("/prediction/2").text)["states"]
+    closed = _scene(client.get("/prediction/3").text)["states"]["closed"]
     assert set(states) == {"start", "dataset's grasp"}
     # The first link is the palm's.
     assert states["start"]["links"][0] == closed["links"][0]
@@ -114,7 +99,7 @@ def _scene(page: str) -> dict[str, Any]:
 
 
 def test_without_results_there_are_no_predictions(out: Path) -> None:
-    client = TestClient(make_app(Inspection(out)), base_url="http://127.0.0.1")
+    client = open_pages(out)
     assert client.get("/predictions").status_code == 404
     assert "/predictions" not in client.get("/").text
 
@@ -169,7 +154,7 @@ def test_a_field_that_a_file_lacks_is_a_dash(out: Path, results: Path) -> None:
     with h5py.File(results, "r+") as file:
         for name in set(file["grasps"]) - {"object", "outcome", "p_OQ", "nhat_Q_O"}:
             del file[f"grasps/{name}"]
-    client = TestClient(make_app(Inspection(out, results)), base_url="http://127.0.0.1")
+    client = open_pages(out, results)
     assert shown(client, "verdict=held") == ["0", "1"]
     assert "4.0 mm" in client.get("/prediction/0").text  # from the true contact
     assert client.get("/prediction/0").text.count("<td>–</td>") > 10

@@ -6,18 +6,17 @@ import io
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from helpers.pages import Tags, state_of
+from helpers.pages import Tags, open_pages, state_of
 from PIL import Image
 from starlette.testclient import TestClient
 
 from drakegrasp.generation.scenes import make_scenes
-from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.page.scenes import FAILS, HOLDS, UNKNOWN
 
 pytestmark = pytest.mark.sim
@@ -38,9 +37,8 @@ def spoiled(made: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def client(made: Path) -> Iterator[TestClient]:
-    with TestClient(make_app(Inspection(made)), base_url="http://127.0.0.1:8321") as client:
-        yield client
+def client(made: Path) -> TestClient:
+    return open_pages(made)
 
 
 def cards(client: TestClient, query: str = "") -> list[str]:
@@ -142,9 +140,9 @@ def change(name: str, value: object) -> Callable[[Path], None]:
 
 def test_grasp_without_a_pose_is_not_drawn(spoiled: Path) -> None:
     def palms() -> int:
-        with TestClient(make_app(Inspection(spoiled)), base_url="http://127.0.0.1:8321") as client:
-            label = label_of(cards(client, "sort=row&order=up")[0])
-            return client.get(f"/scene/{label}").text.count('"z": ')
+        client = open_pages(spoiled)
+        label = label_of(cards(client, "sort=row&order=up")[0])
+        return client.get(f"/scene/{label}").text.count('"z": ')
 
     before = palms()
     change("grasps/X_TG", np.nan)(spoiled / "scenes.hdf5")
@@ -166,13 +164,13 @@ def test_file_that_cannot_be_shown_is_a_line(
     spoiled: Path, spoil: Callable[[Path], None], line: str
 ) -> None:
     spoil(spoiled / "scenes.hdf5")
-    with TestClient(make_app(Inspection(spoiled)), base_url="http://127.0.0.1:8321") as client:
-        answer = client.get("/scenes")
-        assert answer.status_code == 400 and line in Tags(answer.text).text
-        assert 'href="/scenes"' in client.get("/").text
+    client = open_pages(spoiled)
+    answer = client.get("/scenes")
+    assert answer.status_code == 400 and line in Tags(answer.text).text
+    assert 'href="/scenes"' in client.get("/").text
 
 
 def test_without_scenes_there_is_no_link(boxes: Path, tmp_path: Path) -> None:
-    with TestClient(make_app(Inspection(boxes)), base_url="http://127.0.0.1:8321") as client:
-        assert "scenes" not in client.get("/").text
-        assert client.get("/scenes").status_code == 404
+    client = open_pages(boxes)
+    assert "scenes" not in client.get("/").text
+    assert client.get("/scenes").status_code == 404

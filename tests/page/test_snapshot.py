@@ -1,20 +1,29 @@
-"""The attempts in memory: of assembled files, and of files that are missing."""
+"""The attempts in memory: what the files say of them, and how a query chooses and sorts them."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from urllib.parse import parse_qsl
 
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import OTM, OTO, SLIP, TRIALS, change, set_at
+from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
+from helpers.pages import numbered
 
+from drakegrasp.dataset.quality import GRAVITY
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
+from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.page.attempts import Attempts
-from drakegrasp.page.renders import read_render, read_rows
-from drakegrasp.page.snapshot import FEATURES, read_snapshot
+from drakegrasp.page.renders import THUMBNAIL, contact_dots, read_render, read_rows
+from drakegrasp.page.snapshot import FEATURES, Snapshot, read_snapshot
+from drakegrasp.vision.camera import intrinsics, project
+
+NOTHING = Decisions()
 
 
 def test_table_is_what_the_files_say(boxes: Path) -> None:
@@ -54,24 +63,134 @@ def test_rows_and_images_are_those_of_the_attempt(boxes: Path) -> None:
     assert read_render(snapshot, i + 1, "otm") is None
 
 
-def test_a_contact_without_a_normal_has_the_largest_angle(out: Path) -> None:
-    change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
-    snapshot = read_snapshot(out)
-    assert snapshot.table.normal_angle[0] == np.inf
-    table = Attempts(snapshot, Decisions())
-    assert table.select(Attempts.query({"sort": "normal_angle"}))[0] == 0
-
-
-def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="must be the directory of a dataset"):
-        read_snapshot(tmp_path)
-    (tmp_path / TRIALS).write_bytes(b"nothing")
-    with pytest.raises(DataError, match="must be the trials of a dataset, got none"):
-        read_snapshot(tmp_path)
-
-
 def test_trials_that_are_a_link_to_nowhere_are_damaged_and_not_still_to_come(out: Path) -> None:
     (out / "trials.hdf5").unlink()
     (out / "trials.hdf5").symlink_to("trials.hdf5")
     with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials of a dataset"):
         read_snapshot(out)
+
+
+# Attempts with a mass and a camera of their own.
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The boxes, each attempt with a mass and cameras of its own. Read only."""
+    folder = tmp_path_factory.mktemp("drawn")
+    draws = ("mass=[0.5, 1.5]", "camera_shift=0.02", "camera_turn_deg=10")
+    return make_dataset(folder / "out", folder, overrides=[f"randomize.{draw}" for draw in draws])
+
+
+def imbalance(out: Path) -> np.ndarray:
+    """Return that of every attempt; nothing carries the weight.
+
+    The fingertips of every success push with 12.5 N along -y of {O}.
+    """
+    with h5py.File(out / TRIALS) as file:
+        weights = GRAVITY * file["trials/mass"][:]
+        y_T = unpack_pose(file["trials/X_TO_lifted"][:])[:, :3, 1]
+    rest_T = -12.5 * y_T - weights[:, None] * np.array([0.0, 0.0, 1.0])
+    return np.linalg.norm(rest_T, axis=1) / weights
+
+
+def test_anomaly_is_of_the_drawn_mass(drawn: Path) -> None:
+    snapshot, expected = read_snapshot(drawn), imbalance(drawn)
+    for i in (0, 3, 11):
+        assert snapshot.table.imbalance[i] == pytest.approx(expected[i], rel=1e-6)
+
+
+@pytest.mark.parametrize("camera", ["oto", "otm"])
+def test_dots_are_where_the_moved_camera_sees_the_contacts(drawn: Path, camera: str) -> None:
+    snapshot = read_snapshot(drawn)
+    data = GraspDataset(drawn / f"grasping_{camera}.hdf5", split="test")
+    trial = int(data.column("trial_id")[0])
+    (row,) = read_rows(snapshot, [trial], THUMBNAIL)
+    X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{camera}")[0].astype(float))
+    X_CO = invert_pose(X_TC) @ unpack_pose(row["X_TO"])
+    expected = project(
+        intrinsics(snapshot.config.camera), transform_points(X_CO, row["closed_p_OQ"])
+    )
+    dots = contact_dots(snapshot, row, camera)
+    assert len(dots) == 3
+    np.testing.assert_allclose([[dot.u, dot.v] for dot in dots], expected, atol=0.01)
+
+
+# Filters and order: each filter chooses by its own column, in the units that are shown.
+
+
+@pytest.fixture
+def snapshot(boxes: Path) -> Snapshot:
+    return read_snapshot(boxes)
+
+
+def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:
+    places = Attempts(snapshot, decisions).select(Attempts.query(dict(parse_qsl(text))))
+    return [numbered(snapshot, str(i)) for i in places]
+
+
+@pytest.mark.parametrize(
+    ("text", "labels"),
+    [
+        ("outcome=slipped", ["0-1-1", "1-1-1", "2-1-1"]),
+        ("object=2_box_b", ["1-0-0", "1-1-0", "1-3-2"]),
+        ("class=brick", ["2-0-0", "2-1-0", "2-3-2"]),
+        ("class=brick&object=2_box_b", []),
+        ("object=nothing", []),
+        ("split=none", []),
+        ("removal=other_links", []),
+    ],
+)
+def test_each_filter_chooses_its_own(snapshot: Snapshot, text: str, labels: list[str]) -> None:
+    assert chosen(snapshot, f"{text}&sort=row&order=up") == labels
+
+
+def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
+    split = snapshot.table.split.copy()
+    split[[0, 3]] = NONE
+    changed = replace(snapshot, table=snapshot.table.with_columns(split=split))
+    assert len(chosen(changed, "split=samples&outcome=any")) == 7
+    assert set(chosen(changed, "split=none")) == {"0-0-0", "0-1-0"}
+
+
+def test_order_is_by_the_quantity_and_those_without_come_last(snapshot: Snapshot) -> None:
+    score = snapshot.table.anomaly.copy()
+    score[[0, 3, 11]] = [5.0, np.nan, 7.0]
+    changed = replace(snapshot, table=snapshot.table.with_columns(anomaly=score))
+    down, up = chosen(changed, ""), chosen(changed, "order=up")
+    assert down[:2] == ["0-3-2", "0-0-0"]
+    assert up[-3:] == ["0-0-0", "0-3-2", "0-1-0"]
+    assert down[-1] == up[-1] == "0-1-0"
+    rows = chosen(snapshot, "sort=row&order=up")
+    assert rows[:3] == ["0-0-0", "0-1-0", "0-3-2"]  # "smallest first"
+    assert chosen(snapshot, "sort=row") == rows[::-1]
+
+
+def test_decisions_choose_what_is_left(snapshot: Snapshot) -> None:
+    a, b = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
+    gone = AttemptKey("no object", 0, 0)
+    decisions = Decisions(rejected=frozenset([a, gone]), kept=frozenset([b]))
+    assert chosen(snapshot, "decision=rejected", decisions) == ["0-0-0"]
+    # Failures are never decided, so they are not open either.
+    for text in ("decision=open", "decision=open&outcome=any"):
+        assert len(chosen(snapshot, text, decisions)) == 8
+
+
+def test_address_of_a_query_gives_the_query_again() -> None:
+    text = "outcome=any&object=a%26b%3Dc&sort=slip&order=up&page=3&hold=stable"
+    query = Attempts.query(dict(parse_qsl(text)))
+    assert Attempts.query(dict(parse_qsl(query.params()))) == query
+    assert query["object"] == "a&b=c" and not query["outcome"]
+    assert Attempts.query().params() == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("outcome=good", "outcome must be one of any, success, .* got 'good'"),
+        ("sort=x", "sort must be one of"),
+        ("page=-1", "page must be a number"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused(text: str, words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        Attempts.query(dict(parse_qsl(text)))
