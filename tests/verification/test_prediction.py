@@ -178,14 +178,6 @@ def test_the_frames_agree(single, cameras):
         np.testing.assert_allclose(X, np.squeeze(X_TC), atol=1e-6)
 
 
-@pytest.mark.parametrize("frame", GRASP_FRAMES)
-def test_no_grasps_have_no_contacts_in_any_frame(frame):
-    none = np.zeros((0, 18))
-    for X_TC in [np.eye(4), np.zeros((0, 4, 4))] if frame == "camera" else [None]:
-        placed = placed_at(np.eye(4), np.eye(4))
-        assert place_on_object(none, placed, frame=frame, X_TC=X_TC) == []
-
-
 @pytest.mark.parametrize(
     ("frame", "X", "message"),
     [

@@ -215,22 +215,6 @@ def test_invalid_row_is_a_verdict_without_a_trial(cube):
     assert found.explain() == "The grasp of 1_cube_a fails (invalid): number 1 is nan, not finite."
 
 
-def test_three_contacts_on_one_face_hold_nothing(cube):
-    half = CUBE / 2.0
-    p = np.array([[half, -0.02, 0.0], [half, 0.02, 0.0], [half, 0.0, 0.02]])
-    found = verify(cube, p, np.tile([1.0, 0.0, 0.0], (3, 1)))
-    assert not found.success and found.epsilon == 0.0
-
-
-def test_contacts_that_no_hand_spans_are_tried_and_fail(tmp_path):
-    model = box_model(tmp_path, [0.5, 0.1, 0.1], "1_beam_a")
-    p = np.array([[0.25, 0.0, 0.0], [0.0, 0.05, 0.0], [-0.25, 0.0, 0.0]])
-    n = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    found = verify(PlacedObject(model=model, X_TO=standing(model)), p, n)
-    assert not found.success and found.trial is not None
-    assert found.fit is not None and found.fit.residual.max() > 0.05
-
-
 def test_at_little_friction_it_does_not_hold(cube, grasp):
     found = verify(cube, *grasp, override_config(CONFIG, ["physics.friction_hand=0.05"]))
     assert found.outcome in (Outcome.DROPPED, Outcome.SLIPPED, Outcome.PARTLY_HELD)
