@@ -117,24 +117,33 @@ def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
     assert sum(a != b for a, b in pairwise(of_objects)) == len(set(names)) - 1
 
 
-@pytest.mark.parametrize("together", [1, 2, 9])
-def test_results_are_delivered_in_order_from_any_executor(
-    cube: PlacedObject, together: int
+@pytest.mark.parametrize(("together", "tasks"), [(1, 20), (16, 2), (30, 1)])
+def test_results_are_delivered_in_order_and_the_object_is_sent_once_in_a_task(
+    cube: PlacedObject, together: int, tasks: int
 ) -> None:
     """Workers finish in any order, and never send the object back."""
+    sent, received, delivered = list[bytes](), list[bytes](), list[int]()
 
     def backwards(function, items):
-        return (function(pickle.loads(pickle.dumps(item))) for item in reversed(list(items)))
+        for item in reversed(list(items)):
+            sent.append(pickle.dumps(item))
+            received.append(pickle.dumps(function(pickle.loads(sent[-1]))))
+            yield pickle.loads(received[-1])
 
-    grasps = np.tile(GRASP.ravel(), (3, 1))
-    grasps[:, 0] += 0.02 * np.arange(3)
-    placed, delivered = place(grasps, cube), list[int]()
+    grasps = np.tile(GRASP.ravel(), (20, 1))
+    grasps[:, 0] += 0.002 * np.arange(20)
+    grasps[3:, 9:] = 0.0  # no grasps, so that they cost nothing
+    placed = place(grasps, cube)
     results = verify_batch(
         placed, backwards, silent, lambda i, _: delivered.append(i), together=together
     )
-    assert delivered == [0, 1, 2]
-    assert [r.p_OQ[0, 0] for r in results] == pytest.approx(grasps[:, 0], abs=1e-4)
+    assert delivered == list(range(20)) and len(sent) == tasks
+    assert [r.p_OQ[0, 0] for r in results[:3]] == pytest.approx(grasps[:3, 0], abs=1e-4)
+    assert [r.outcome for r in results[3:]] == [Outcome.INVALID] * 17
     assert all(r.placed is placed[0].placed for r in results)
+    size, config = len(pickle.dumps(cube)), len(pickle.dumps(cube.config))
+    assert max(map(len, sent)) < 2 * size + 20 * config
+    assert not any(b"visual_vertices" in each for each in received)
 
 
 @pytest.mark.parametrize(("count", "sizes"), [(9, [2, 2, 2, 2, 1]), (200, [16] * 12 + [8])])
@@ -161,26 +170,6 @@ def test_workers_get_tasks_of_few_grasps(
 @pytest.mark.parametrize("where", [{}, {"frame": "camera", "X_TC": np.eye(4)}])
 def test_no_grasps_are_no_work(cube: PlacedObject, where: dict) -> None:
     assert verify_grasps(np.zeros((0, 18)), cube, **where) == []
-
-
-def test_object_goes_to_a_worker_with_many_grasps_and_does_not_come_back(
-    cube: PlacedObject,
-) -> None:
-    sent, received = list[int](), list[int]()
-
-    def far_away(function, items):
-        for item in items:
-            there = pickle.dumps(item)
-            back = pickle.dumps(function(pickle.loads(there)))
-            sent.append(len(there))
-            received.append(len(back))
-            yield pickle.loads(back)
-
-    placed = place(np.tile(GRASP.ravel(), (20, 1)), cube)
-    verify_batch(placed, far_away, silent, together=16)
-    size = len(pickle.dumps(cube))
-    assert len(sent) == 2 and max(sent) < 2 * size + 20 * len(pickle.dumps(cube.config))
-    assert not any(b"visual_vertices" in pickle.dumps(each) for each in received)
 
 
 def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
@@ -223,22 +212,6 @@ def test_contacts_in_the_frame_of_the_mesh_file_are_told_and_read_on_a_sample(
 
 
 @pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        ([0.5], "rows must be whole numbers, got values of type float64"),
-        ([True], "rows must be whole numbers, got values of type bool"),
-        ([-1], "rows must be 0 to"),
-        ([0, 1], r"rows must be one per grasp \(1\), got 2"),
-        (None, "without rows there must be a grasp for each of the"),
-    ],
-)
-def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, words: str) -> None:
-    grasps = test_split.column("grasps")[:1]
-    with pytest.raises(GraspError, match=words):
-        verify_grasps(grasps, test_split, rows=rows)
-
-
-@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"units": "cm"}, "units must be None on a GraspDataset, which defines it, got a value"),
@@ -253,7 +226,12 @@ def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, wor
         ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
         ({"config": {}}, "config must be a Config, see load_config, got a dict"),
         ({"frame": "palm"}, "frame must be one of object, table, camera, world, mesh, got 'palm'"),
+        ({"rows": [0.5]}, "rows must be whole numbers, got values of type float64"),
+        ({"rows": [True]}, "rows must be whole numbers, got values of type bool"),
+        ({"rows": [-1]}, "rows must be 0 to"),
+        ({"rows": [0, 1]}, r"rows must be one per grasp \(1\), got 2"),
         ({"rows": []}, r"rows must be one per grasp \(1\), got 0"),
+        ({"rows": None}, "without rows there must be a grasp for each of the"),
         # Its objects are prepared: what the configuration says of them could not be kept.
         (
             {"config": load_config(overrides=["objects.mass=2"])},

@@ -8,7 +8,6 @@ from collections import Counter
 
 import h5py
 import pytest
-import yaml
 from helpers.datasets import make_dataset
 
 from drakegrasp.api.building import make_benchmark
@@ -52,20 +51,19 @@ BOTTLE = next(item.name for item in draw_builtin(CONFIG.builtin) if item.name.st
 @pytest.fixture(scope="module")
 def part(tmp_path_factory):
     """One object of the benchmark, with the manifest that a build would write."""
-    out = tmp_path_factory.mktemp("benchmark")
+    return made(tmp_path_factory.mktemp("benchmark"))
+
+
+def made(out, config=CONFIG, **stated):
+    """Write one object and the manifest of a build."""
     write_objects(out, CONFIG, only=[BOTTLE])
-    write_manifest(Manifest(config=CONFIG, versions=installed_versions(CONFIG)), out)
+    write_manifest(Manifest(config=config, versions=installed_versions(config), **stated), out)
     return out
-
-
-def test_every_object_is_published_and_no_other():
-    names = {item.name for item in draw_builtin(CONFIG.builtin)}
-    assert published()["objects"].keys() == names
-    assert len(names) >= 200
 
 
 def test_each_class_has_all_frictions_and_masses_are_used_alike():
     items = draw_builtin(CONFIG.builtin)
+    assert published()["objects"].keys() == {item.name for item in items} and len(items) >= 200
     frictions: dict[str, set[float]] = {}
     for item in items:
         frictions.setdefault(item.object_class.name, set()).add(material_of(item)[1])
@@ -81,29 +79,25 @@ def test_draws_are_frozen():
     assert material_of(first) == FIRST_MATERIAL
     assert new_classes() == NEW
     assert set(NEW) < {item.name for item in CLASSES}
-    assert len(NEW) == NEW_CLASSES
+    assert len(NEW) == NEW_CLASSES and CONFIG.split.train_classes == ()
 
 
-def test_meshes_are_those_published_and_have_their_own_material(part):
+def test_a_part_has_the_published_meshes_and_materials_and_is_not_frozen(part):
     about = read_benchmark(part, SCORED, published()["versions"])
     assert about["different_meshes"] == []
     assert about["other_settings"] == ""
     assert about["other_versions"] == {}
+    assert (about["objects"], about["of"], about["frozen"]) == (1, 256, False)
     (source,) = find_meshes(part / BUILTIN_FOLDER)
     item = next(item for item in draw_builtin(CONFIG.builtin) if item.name == BOTTLE)
+    assert source.name == BOTTLE
     assert (source.mass, source.friction) == material_of(item)
-
-
-def test_a_part_of_the_benchmark_is_not_frozen(part):
-    about = read_benchmark(part, SCORED, published()["versions"])
-    assert (about["objects"], about["of"], about["frozen"]) == (1, 256, False)
 
 
 def test_a_score_by_other_rules_is_not_frozen(tmp_path, monkeypatch):
     whole = {"objects": {BOTTLE: published()["objects"][BOTTLE]}, "versions": {}}
     monkeypatch.setattr(benchmark, "published", lambda: whole)
-    write_objects(tmp_path, CONFIG, only=[BOTTLE])
-    write_manifest(Manifest(config=CONFIG, versions=installed_versions(CONFIG)), tmp_path)
+    made(tmp_path)
     looser = override_config(SCORED, ["verify.max_contact_error=0.06"])
     for config, other in ((SCORED, ""), (looser, "max_contact_error"), (CONFIG, "max_tries")):
         about = read_benchmark(tmp_path, config, {})
@@ -125,13 +119,7 @@ def test_a_folder_of_something_else_stays_as_it_is(tmp_path, manifest):
 
 
 def test_a_finished_benchmark_is_not_made_a_part_of_itself(tmp_path):
-    write_objects(tmp_path, CONFIG, only=[BOTTLE])
-    stored = Manifest(
-        config=CONFIG,
-        versions=installed_versions(CONFIG),
-        refused=(RefusedMesh(name=BOTTLE, mesh_sha256="0", reason="too heavy"),),
-    )
-    write_manifest(stored, tmp_path)
+    made(tmp_path, refused=(RefusedMesh(name=BOTTLE, mesh_sha256="0", reason="too heavy"),))
     before = {path: path.read_bytes() for path in (tmp_path / BUILTIN_FOLDER).iterdir()}
     with pytest.raises(DataError, match=f"every mesh .* got none named {BOTTLE}"):
         make_benchmark(tmp_path, only=["6_can_1"], show=False)
@@ -140,9 +128,7 @@ def test_a_finished_benchmark_is_not_made_a_part_of_itself(tmp_path):
 
 def test_other_meshes_versions_and_settings_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "wavefront", lambda mesh: b"v 0 0 0\n")
-    write_objects(tmp_path, CONFIG, only=[BOTTLE])
-    other = load_config(PRESET, ["lift.hold_time=1"])
-    write_manifest(Manifest(config=other, versions=installed_versions(other)), tmp_path)
+    made(tmp_path, load_config(PRESET, ["lift.hold_time=1"]))
     about = read_benchmark(tmp_path, SCORED, {**published()["versions"], "drake": "0"})
     assert about["different_meshes"] == [BOTTLE]
     assert list(about["other_versions"]) == ["drake"]
@@ -161,12 +147,6 @@ def test_an_unknown_object_is_refused(tmp_path):
     with pytest.raises(MeshError, match="'99_chair_1'"):
         write_objects(tmp_path, CONFIG, only=["99_chair_1"])
     assert not list(tmp_path.iterdir())
-
-
-def test_all_objects_test(part):
-    assert CONFIG.split.train_classes == ()
-    said = yaml.safe_load((part / BUILTIN_FOLDER / "objects.yaml").read_text())
-    assert said["objects"].keys() == {BOTTLE}
 
 
 @pytest.mark.parametrize("field", ["grasps", "grasp_props/X_CG", "object_props/frame_world2obj"])

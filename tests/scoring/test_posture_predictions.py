@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.datasets import OTO, make_dataset
+from helpers.datasets import OTO
 
 from drakegrasp.api.scoring import score
 from drakegrasp.dataset.reader import GraspDataset
@@ -41,13 +41,6 @@ def camera_poses(data, rows):
     X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[rows])
     X_TO = unpack_pose(Trials(data.path.parent)["X_TO"][data.column("trial_id")[rows]])
     return np.asarray(invert_pose(X_TO) @ X_TC)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scored")
-    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
-    return GraspDataset(out / OTO, split="test")
 
 
 def test_postures_of_rows_are_ranked_and_bad_ones_keep_their_reason(data, tmp_path):

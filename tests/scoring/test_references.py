@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.datasets import OTO, make_dataset
 
 import drakegrasp as dg
 from drakegrasp.dataset.reader import GraspDataset
@@ -17,13 +16,8 @@ from drakegrasp.scoring.references import REFERENCES, Scene
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene")
-    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
-    data = GraspDataset(out / OTO, split="test")
-    return Scene(
-        data=data, rows=list(range(len(data))), train=GraspDataset(out / OTO, split="train")
-    )
+def scene(data):
+    return Scene(data=data, rows=range(len(data)), train=GraspDataset(data.path, split="train"))
 
 
 #: Those that are grasps of contacts.

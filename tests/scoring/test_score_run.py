@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.datasets import OTM, OTO, make_dataset
+from helpers.datasets import OTM, OTO
 from helpers.scores import FakeVerify
 
 import drakegrasp as dg
@@ -22,13 +22,6 @@ from drakegrasp.scoring.card import card_text
 from drakegrasp.scoring.run import VERDICTS, score
 from drakegrasp.scoring.verdict import ranked_sets
 from drakegrasp.verification.placing import dataset_config
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scored")
-    out = make_dataset(folder / "out", folder / "meshes", overrides=["split.by=class"])
-    return GraspDataset(out / OTO, split="test")
 
 
 def scored(data, /, given=(), *, tries=None, others=None, overridden=(), **changes):

@@ -197,16 +197,6 @@ def test_one_point_in_the_air_is_told(cube, grasp):
     assert not any(word in text for word in ("Before closing", "In a dataset"))
 
 
-def test_contacts_in_the_frame_of_the_mesh_are_known_on_a_mesh(held, cube, grasp):
-    mesh = cube.model.visual.copy()
-    mesh.apply_translation([0.0, 0.3, 0.1])
-    there = dg.transform_grasp(make_pose(np.eye(3), [0.0, 0.3, 0.1]), dg.pack_grasp(*grasp))
-    verdict = dg.verify_grasp(there, mesh, frame="mesh")
-    np.testing.assert_allclose(verdict.p_OQ, held.p_OQ, atol=1e-4)
-    lost = dg.verify_grasp(there, mesh)
-    assert lost.hints == ("the mesh file's frame (mesh)",)
-
-
 def test_invalid_row_is_a_verdict_without_a_trial(cube):
     found = verify(cube, np.full((3, 3), np.nan), np.eye(3))
     assert found.outcome is Outcome.INVALID and not found.outcome.inconclusive
