@@ -19,7 +19,6 @@ from drakegrasp.dataset.statistics import (
     count_funnel,
     count_splits,
     held_note,
-    objects_without_samples,
 )
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
@@ -28,8 +27,6 @@ from drakegrasp.outcomes import GROUPS, Outcome
 
 #: Outcomes in the order of the funnel. Outcomes that only verdicts have are not among them.
 _FUNNEL = [o for group in GROUPS for o in Outcome if o.group == group]
-#: Maximum number of objects without samples whose reasons are printed.
-BARREN = 10
 #: Width of the console [characters]: every table fits.
 WIDTH = 1000
 
@@ -131,13 +128,6 @@ def approach_line(funnel: Funnel) -> str:
     return f"{found} in {cells}; above the table they come from {shares}"
 
 
-def barren_lines(funnel: Funnel) -> list[str]:
-    """Return why objects have no sample: a line for each of the first, and one for the others."""
-    why = [f"no sample of {_safe(n)}: {w}" for n, w in objects_without_samples(funnel).items()]
-    left = len(why) - BARREN
-    return why[:BARREN] + ([f"no sample of {counted(left, 'other object')}"] if left > 0 else [])
-
-
 def _count(number: int) -> str:
     return f"{int(number):,}"
 
@@ -160,6 +150,4 @@ def print_stats(out: Path) -> None:
     console.print()
     console.print(split_table(count_splits(out), read_manifest(out).config.split.by))
     if line := approach_line(funnel):
-        say(line)
-    for line in barren_lines(funnel):
         say(line)

@@ -24,17 +24,12 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import file_attributes, shards_sha256
 from drakegrasp.dataset.hdf5 import (
-    DATA_TABLES,
-    OF_CAMERA,
-    OF_SCENES,
-    ORIGIN,
-    SCENE_TABLES,
-    TRIAL_TABLES,
+    SAMPLES,
+    SCENES,
+    TRIALS,
     AnyArray,
-    Kinds,
-    Tables,
-    attribute_mistakes,
-    differences,
+    Layout,
+    mistakes,
     open_hdf5,
     open_samples,
     read_columns,
@@ -77,11 +72,11 @@ from drakegrasp.vision.camera import project
 
 #: Number of rows in a task: some 20 MB.
 TASK_ROWS = 1024
-#: Attributes and fields of each file.
-FILES: Mapping[str, tuple[Kinds, Tables]] = {
-    TRIALS_FILE: (ORIGIN, TRIAL_TABLES),
-    **dict.fromkeys(DATA_FILES.values(), (OF_CAMERA, DATA_TABLES)),
-    SCENES_FILE: (OF_SCENES, SCENE_TABLES),
+#: Layouts of the files.
+FILES: Mapping[str, Layout] = {
+    TRIALS_FILE: TRIALS,
+    **dict.fromkeys(DATA_FILES.values(), SAMPLES),
+    SCENES_FILE: SCENES,
 }
 #: Attributes that identify the state of a dataset that a file is of.
 STATE = ("signature", "shards")
@@ -250,15 +245,16 @@ def _header(path: Path, due: Mapping[str, Any], found: list[Violation]) -> _Head
         due: The attributes that the file would be written with now, as far as they are known.
         found: Gets the violations.
     """
-    kinds, tables = FILES[path.name]
+    layout = FILES[path.name]
     with open_hdf5(path) as file:
         validate_schema_version(path, file.attrs.get("schema_version"))
-        mistakes, layout = list(attribute_mistakes(file, kinds)), list(differences(file, tables))
+        wrong = list(mistakes(file, layout))
         # A group with an invalid column is not read; without sound attributes, nothing is.
-        broken = {*tables} if mistakes else {each.path[1:].split("/")[0] for each in layout}
-        counts = {g: len(file[g][tables[g][0].name]) for g in tables if g not in broken}
+        broken = {each.path[1:].split("/")[0] for each in wrong}
+        read = layout.tables.keys() - broken if "" not in broken else ()
+        counts = {g: len(file[g][layout.tables[g][0].name]) for g in layout.tables if g in read}
         attributes = dict(file.attrs)
-    for each in (*mistakes, *layout):
+    for each in wrong:
         found.append(Violation(file=path.name, group=each.path, what=each.what, got=each.got))
 
     # The first other attribute is the cause of the others. Verdicts may get other settings, which
@@ -272,9 +268,7 @@ def _header(path: Path, due: Mapping[str, Any], found: list[Violation]) -> _Head
         again = f"another; run `drakegrasp {command}` again"
         what = f"attribute {other} must be that of {of}"
         found.append(Violation(file=path.name, what=what, got=again))
-    return _Header(
-        attributes=attributes, counts=counts, mistakes=bool(mistakes or layout), other=bool(other)
-    )
+    return _Header(attributes=attributes, counts=counts, mistakes=bool(wrong), other=bool(other))
 
 
 def _seal(path: Path) -> list[Violation]:
@@ -378,7 +372,7 @@ class _Rows:
     @property
     def fields(self) -> tuple[Field, ...]:
         """Fields of the group."""
-        return FILES[self.path.name][1][self.group]
+        return FILES[self.path.name].tables[self.group]
 
 
 #: The words of a rule, the rows (n,) that break it, and what they have instead (n, ...).

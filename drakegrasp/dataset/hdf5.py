@@ -245,39 +245,53 @@ OF_CAMERA: Kinds = {**ORIGIN, "camera": "one of oto, otm", "split_by": "one of c
 OF_SCENES: Kinds = {key: kind for key, kind in ORIGIN.items() if key != "K"}
 
 
-def attribute_mistakes(file: h5py.File, kinds: Kinds) -> Iterator[Difference]:
-    """Yield the attributes of a file that are missing or hold something else."""
-    for key, kind in kinds.items():
+class Layout(NamedTuple):
+    """What a kind of file holds.
+
+    Attributes:
+        what: Description of such a file, for messages.
+        kinds: Kinds of its attributes.
+        tables: Fields of its groups.
+    """
+
+    what: str
+    kinds: Kinds
+    tables: Tables
+
+
+#: Layouts of grasping_oto.hdf5 and grasping_otm.hdf5, trials.hdf5, scenes.hdf5.
+SAMPLES = Layout("a data file of drakegrasp", OF_CAMERA, DATA_TABLES)
+TRIALS = Layout("the trials of a dataset", ORIGIN, TRIAL_TABLES)
+SCENES = Layout("the scenes of a dataset", OF_SCENES, SCENE_TABLES)
+
+
+def mistakes(file: h5py.File, layout: Layout) -> Iterator[Difference]:
+    """Yield the attributes of a file that are missing or hold something else, and `differences`."""
+    for key, kind in layout.kinds.items():
         value = file.attrs.get(key)
         if not _KINDS[kind](value):
             got = printable(" ".join(repr(value).split())[:60]) if key in file.attrs else "none"
             yield Difference("", f"attribute {key} must be {kind}", got)
+    yield from differences(file, layout.tables)
 
 
 @contextmanager
-def _opened_whole(path: Path, what: str, kinds: Kinds, tables: Tables) -> Iterator[h5py.File]:
+def _opened_whole(path: Path, layout: Layout) -> Iterator[h5py.File]:
     """Open a file, see `opened`, and reject it if it differs from the schema."""
-    with opened(path, what) as file:
+    with opened(path, layout.what) as file:
         # Check the version first: another version may have other attributes, and a foreign file
         # has none.
         if "schema_version" not in file.attrs:
             raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
         validate_schema_version(path, file.attrs["schema_version"])
-        raise_first_mistake(path, attribute_mistakes(file, kinds))
-        raise_first_mistake(path, differences(file, tables))
+        raise_first_mistake(path, mistakes(file, layout))
         yield file
 
 
-#: Context managers that open a file of a dataset, given its path: grasping_oto.hdf5 or
-#: grasping_otm.hdf5, trials.hdf5, scenes.hdf5. They raise a DataError if the file is missing,
-#: damaged, or differs from the schema.
+#: Context managers that open a file of a dataset, given its path. They raise a DataError if the
+#: file is missing, damaged, or differs from its layout.
 open_samples, open_trials, open_scenes = (
-    partial(_opened_whole, what=what, kinds=kinds, tables=tables)
-    for what, kinds, tables in (
-        ("a data file of drakegrasp", OF_CAMERA, DATA_TABLES),
-        ("the trials of a dataset", ORIGIN, TRIAL_TABLES),
-        ("the scenes of a dataset", OF_SCENES, SCENE_TABLES),
-    )
+    partial(_opened_whole, layout=layout) for layout in (SAMPLES, TRIALS, SCENES)
 )
 
 

@@ -1,4 +1,4 @@
-"""Counts of a dataset: the funnel by object, the paper's Table III, and objects without samples."""
+"""Counts of a dataset: the funnel by object, and the paper's Table III."""
 
 from __future__ import annotations
 
@@ -222,21 +222,3 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
         "objects": objects,
         "splits": [asdict(split) for split in count_splits(out)],
     }
-
-
-def objects_without_samples(funnel: Funnel) -> dict[str, str]:
-    """Return, for each object without a sample, how most of its attempts ended, by its name."""
-    why = dict[str, str]()
-    for i in np.flatnonzero(funnel.samples == 0).tolist():
-        outcomes, removals = funnel.outcomes[i], funnel.removals[i]
-        if not outcomes.any():
-            why[funnel.names[i]] = "nothing was tried"
-        elif held := int(outcomes[Outcome.SUCCESS]):
-            # Held grasps are closest to a sample.
-            removal = Removal(int(np.argmax(removals)))
-            why[funnel.names[i]] = f"{held:,} held, mostly {removal.label} ({max(removals):,})"
-        else:
-            most = Outcome(int(np.argmax(outcomes)))
-            total = outcomes.sum()
-            why[funnel.names[i]] = f"{outcomes[most]:,} of {total:,} attempts end in {most.label}"
-    return why

@@ -19,7 +19,6 @@ from drakegrasp.dataset.statistics import (
     count_funnel,
     count_splits,
     counts_as_dict,
-    objects_without_samples,
 )
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
@@ -150,18 +149,3 @@ def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=shares)
     (train,) = (count for count in count_splits(out) if count.split == "train")
     assert (train.samples, train.objects, train.classes) == (9, 3, 2)
-
-
-def test_objects_without_samples_say_how_most_attempts_ended(sound: Path) -> None:
-    funnel = count_funnel(sound)
-    assert not objects_without_samples(funnel)
-    for array in (funnel.removals, funnel.outcomes):
-        array[:] = 0
-    funnel.outcomes[1, [Outcome.START_COLLISION, Outcome.SCREENED]] = 842, 358
-    funnel.outcomes[2, [Outcome.DROPPED, Outcome.SUCCESS]] = 9, 2
-    funnel.removals[2, Removal.TURNED] = 2
-    assert objects_without_samples(funnel) == {
-        "1_box_a": "nothing was tried",
-        "2_box_b": "842 of 1,200 attempts end in start_collision",
-        "3_brick": "2 held, mostly turned (2)",
-    }
