@@ -71,10 +71,15 @@ class Coupling:
             raise ValueError("ratio must not be zero, got 0.0")
 
 
-class DrivenBy(BaseModel):
-    """How another finger drives a finger: the closing is `ratio` times the closing of `finger`."""
+class _Keys(BaseModel):
+    """A mapping of the YAML file."""
 
     model_config = _STRICT
+
+
+class DrivenBy(_Keys):
+    """How another finger drives a finger: the closing is `ratio` times the closing of `finger`."""
+
     finger: Name
     ratio: Positive = 1.0
 
@@ -195,43 +200,38 @@ class Finger:
         return beside
 
 
-class Spread(BaseModel):
+class Spread(_Keys):
     """The joints that keep the spread angle during an attempt; a hand may have no such joints."""
 
-    model_config = _STRICT
     joints: tuple[Name, ...] = ()
 
 
-class Preshape(BaseModel):
+class Preshape(_Keys):
     """A grasp type: which fingers close, and the positions of the other joints."""
 
-    model_config = _STRICT
     name: Name
     fingers: Annotated[tuple[Name, ...], Field(min_length=1)]
     joints: dict[Name, Finite] = {}  # fixed joint positions in this preshape [rad or m]
 
 
-class Palm(BaseModel):
+class Palm(_Keys):
     """The palm frame G in the palm link's frame B."""
 
-    model_config = _STRICT
     link: Name
     p_BG: Vector  # [m]
     rpy_deg: Vector = (0.0, 0.0, 0.0)
 
 
-class ForeignFrame(BaseModel):
+class ForeignFrame(_Keys):
     """The frame A in which another tool gives the hand's pose, in the palm link's frame B."""
 
-    model_config = _STRICT
     p_BA: Vector = (0.0, 0.0, 0.0)  # [m]
     rpy_deg: Vector = (0.0, 0.0, 0.0)
 
 
-class HandFile(BaseModel):
+class HandFile(_Keys):
     """The contents of the YAML file."""
 
-    model_config = _STRICT
     version: int
     model: Name  # the SDFormat or URDF file, relative to the YAML file
     palm: Palm

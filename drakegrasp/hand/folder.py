@@ -282,7 +282,11 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
     carried = CarriedHand(path=path, digest=content.digest)
     if known is None and not isinstance(config.hand_source, CarriedHand):
         _validate_no_other_files(content, path)
-    if not _is_there(carried):
+    try:
+        is_there = hand_digest(carried) == carried.digest
+    except HandError:
+        is_there = False
+    if not is_there:
         with disk_full_named(out):
             _write(content, path)
     return config.with_hand(name, carried)
@@ -291,14 +295,6 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
 def _file_name(hand: str) -> str:
     """Return the file name in a dataset of a hand, given by the name of the hand or its file."""
     return PurePath(hand).name if "/" in hand or hand.endswith(".yaml") else f"{hand}_hand.yaml"
-
-
-def _is_there(carried: CarriedHand) -> bool:
-    """Return whether a directory already contains a hand."""
-    try:
-        return hand_digest(carried) == carried.digest
-    except HandError:
-        return False
 
 
 def _validate_no_other_files(content: HandFolder, path: Path) -> None:

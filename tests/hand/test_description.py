@@ -18,12 +18,9 @@ from helpers.hands import (
     write_slider,
     write_tongs,
 )
-from pydrake.geometry import Box, Convex, Cylinder, SceneGraph
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.errors import HandError
-from drakegrasp.frames import Array
 from drakegrasp.hand.checks import overlap_query
 from drakegrasp.hand.description import SLIDE, Hand, load_hand
 from drakegrasp.hand.file_format import MODELS, Coupling
@@ -34,7 +31,7 @@ from drakegrasp.hand.kinematics import (
     fingertip_poses,
     joint_positions,
 )
-from drakegrasp.hand.parsing import add_model
+from drakegrasp.hand.parsing import add_model, declared_masses, read_xml
 from drakegrasp.hand.shapes import link_shapes
 
 #: Mass [kg] and bounding box of the CAD mesh [m] of each kind of link.
@@ -56,31 +53,10 @@ def test_barrett_has_its_published_figures(hand: Hand) -> None:
     np.testing.assert_allclose(hand.X_BG[:3, 3], [0.0, 0.0, 0.07795])
 
 
-def parsed_plant(hand: Hand) -> MultibodyPlant:
-    plant = MultibodyPlant(0.0)
-    add_model(plant, hand.model)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
-    plant.Finalize()
-    return plant
-
-
-def test_masses_are_the_published_ones_and_no_actuator_is_parsed(hand: Hand) -> None:
-    plant = parsed_plant(hand)
-    bodies = [plant.GetBodyByName(name) for name in body_names(plant)]
-    for body in bodies:
-        mass = LINKS[link_kind(body.name())][0]
-        assert body.default_mass() == mass
-        assert body.default_spatial_inertia().IsPhysicallyValid()
-    assert sum(body.default_mass() for body in bodies) == pytest.approx(1.2022, abs=1e-4)
-    assert plant.num_actuators() == 0
-
-
-def body_names(plant: MultibodyPlant) -> list[str]:
-    bodies = [
-        plant.get_body(i)
-        for i in plant.GetBodyIndices(plant.GetModelInstanceByName("barrett_hand"))
-    ]
-    return [body.name() for body in bodies]
+def test_masses_are_the_published_ones(hand: Hand) -> None:
+    masses = declared_masses(read_xml(hand.model.path))
+    assert masses == {name: LINKS[link_kind(name)][0] for name in masses}
+    assert sum(masses.values()) == pytest.approx(1.2022, abs=1e-4)
 
 
 @pytest.mark.parametrize("path", sorted(MODELS.glob("barrett_*.obj")), ids=lambda p: p.stem)
@@ -94,49 +70,14 @@ def test_parts_are_closed_convex_and_wound_outwards_with_normals(path: Path) -> 
     assert mesh.volume == pytest.approx(mesh.convex_hull.volume, rel=1e-6)
 
 
-def shape_points(shape: object) -> Array:
-    """Return points (n, 3) whose bounding box and hull are the shape's."""
-    if isinstance(shape, Box):
-        return trimesh.creation.box(shape.size()).vertices
-    if isinstance(shape, Cylinder):
-        return trimesh.creation.cylinder(shape.radius(), shape.length(), sections=64).vertices
-    assert isinstance(shape, Convex), f"collision shapes must be convex, got {shape}"
-    return trimesh.load(shape.source().path(), process=False).vertices
-
-
-def test_collision_shapes_are_convex_and_fill_the_cad_bounding_boxes(hand: Hand) -> None:
-    plant, scene_graph = built_scene(hand)
-    inspector = scene_graph.model_inspector()
-    names = body_names(plant)
-    assert len(names) == 9
-    for name in names:
-        points = []
-        for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name)):
-            X_LG = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
-            p = shape_points(inspector.GetShape(geometry))
-            points.append(p @ X_LG[:3, :3].T + X_LG[:3, 3])
-        p_L = np.concatenate(points)
+def test_collision_shapes_fill_the_cad_bounding_boxes(hand: Hand) -> None:
+    shapes = link_shapes(hand.model)
+    assert len(shapes) == 9
+    for name, parts in shapes.items():
         _, lower, upper = LINKS[link_kind(name)]
+        p_L = np.concatenate(parts)
         np.testing.assert_allclose(p_L.min(axis=0), lower, atol=4e-3)
         np.testing.assert_allclose(p_L.max(axis=0), upper, atol=4e-3)
-
-
-def test_the_shapes_are_drawn_as_they_collide_and_carry_no_contact_properties(hand: Hand) -> None:
-    plant, scene_graph = built_scene(hand)
-    inspector = scene_graph.model_inspector()
-    for name in body_names(plant):
-        body = plant.GetBodyByName(name)
-        collisions = plant.GetCollisionGeometriesForBody(body)
-        assert len(collisions) == len(plant.GetVisualGeometriesForBody(body))
-        for geometry in collisions:
-            properties = inspector.GetProximityProperties(geometry)
-            assert not properties.HasGroup("hydroelastic")
-
-
-def built_scene(hand: Hand) -> tuple[MultibodyPlant, SceneGraph]:
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(), DiagramBuilder())
-    add_model(plant, hand.model)
-    return plant, scene_graph
 
 
 @pytest.mark.parametrize("spread_deg", [0.0, 11.25, 22.5, 90.0])

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.mesh_files import READ, REFUSED, write_file
 from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
 
 from drakegrasp.errors import HandError, MachineError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.source import read_model
 from drakegrasp.hand_setup import draft_hand
-from drakegrasp.objects.audit import audit
 
 JAW_BOX = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
 MESH = '<geometry><mesh filename="{}"/></geometry>'
@@ -258,27 +256,11 @@ def test_an_inertia_that_no_body_has_is_replaced_and_said(tmp_path: Path, moment
     assert read_model(write_model(tmp_path / "rod", rod)).notes == ()
 
 
-@pytest.mark.parametrize("case", [*READ, *REFUSED])
-def test_a_hand_reads_the_mesh_files_that_objects_read(tmp_path: Path, case: str) -> None:
-    """And refuses the others in the same words: there is one door for meshes."""
-    name, content, _ = (READ | REFUSED)[case]
-    folder = tmp_path / "meshes"
-    folder.mkdir()
-    write_file(folder, name, content)
-    (row,) = audit(folder, units="cm")
-    mesh = f'<mesh filename="meshes/{name}" scale="0.02 0.02 0.02"/>'
-    text = with_mesh("").replace('<mesh filename=""/>', mesh)
-    path = write_model(tmp_path, text.replace('xyz="0 0.006 0.03"', 'xyz="0 0 0"', 1))
-    if case in REFUSED:
-        assert row.status == "refused"
-        with pytest.raises(HandError) as caught:
-            read_model(path)
-        assert str(caught.value) == f"model: mesh {name}: {row.notes[0]}"
-        return
-    assert row.status != "refused"
-    (shape,) = read_model(path).links["left_jaw"].collisions
-    size = np.ptp(shape.corners(), axis=0)
-    np.testing.assert_allclose(size, 2.0 * np.array(row.extents), atol=1e-6)
+def test_a_mesh_has_the_scale_that_the_model_gives(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "jaw.stl")
+    text = with_mesh("jaw.stl").replace('jaw.stl"', 'jaw.stl" scale="2 2 1"')
+    (shape,) = read_model(write_model(tmp_path, text)).links["left_jaw"].collisions
+    np.testing.assert_allclose(np.ptp(shape.corners(), axis=0), [0.04, 0.024, 0.06], atol=1e-9)
 
 
 def test_a_collision_mesh_is_a_hull_of_few_corners(tmp_path: Path) -> None:

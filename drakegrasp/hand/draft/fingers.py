@@ -17,7 +17,7 @@ import numpy as np
 
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
-from drakegrasp.hand.draft.vendor import VendorJoint, VendorModel
+from drakegrasp.hand.draft.vendor import VendorJoint, VendorModel, chain_poses
 
 #: Cosine above which two axes are parallel.
 PARALLEL = 0.94
@@ -171,10 +171,8 @@ def find_closings(model: VendorModel, joints: Sequence[VendorJoint]) -> list[Clo
     for j, joint in enumerate(joints):
         mimic = model.mimic(joint.name)
         motors.setdefault(mimic.leader, []).append((j, mimic.ratio, mimic.offset))
-    X, axes = np.eye(4), []
-    for joint in joints:
-        X = X @ joint.X_PJ
-        axes.append(X[:3, :3] @ joint.axis)
+    frames, _ = chain_poses(joints, np.zeros(len(joints)))
+    axes = [X[:3, :3] @ joint.axis for X, joint in zip(frames, joints, strict=True)]
     bending = {
         leader: moved for leader, moved in motors.items() if _bends_finger(moved, joints, axes)
     }

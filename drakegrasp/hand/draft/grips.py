@@ -34,7 +34,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.checks import PALM_DEPTH, ray_end
 from drakegrasp.hand.draft.fingers import STEPS, Closing
-from drakegrasp.hand.draft.vendor import VendorJoint, VendorModel
+from drakegrasp.hand.draft.vendor import VendorJoint, VendorModel, chain_poses
 from drakegrasp.hand.finger_sweep import even_points
 from drakegrasp.hand.shapes import ray_span
 
@@ -136,7 +136,7 @@ def trace_finger(
     """Return a finger with the path of its pad, for each of its closings."""
     # The end of the fingertip, and its motion.
     last, link = joints[-1], model.links[joints[-1].child]
-    X = _tip_poses(joints, np.stack([closing.path() for closing in closings]))
+    _, X = chain_poses(joints, np.stack([closing.path() for closing in closings]))
     parts = [shape.corners() for shape in link.collisions]
     surface = np.concatenate([even_points(part, SPACING) for part in parts])
     end, along = _end_of(surface, _outward(model, palm, joints) if last.slides else None)
@@ -172,17 +172,9 @@ def trace_finger(
     return found
 
 
-def _tip_poses(joints: Sequence[VendorJoint], q: Array) -> Array:
-    """Return the poses (..., 4, 4) of a fingertip link in the palm link at positions (..., m)."""
-    X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
-    for j, joint in enumerate(joints):
-        X = X @ joint.X_PJ @ joint.motion(q[..., j])
-    return np.asarray(X)
-
-
 def _outward(model: VendorModel, palm: str, joints: Sequence[VendorJoint]) -> Array:
     """Return the direction (3,) from the palm to a sliding fingertip, across its slide."""
-    X, axis = _tip_poses(joints, np.zeros(len(joints))), joints[-1].axis
+    (_, X), axis = chain_poses(joints, np.zeros(len(joints))), joints[-1].axis
     corners = transform_points(X, model.links[joints[-1].child].corners())
     line = X[:3, :3].T @ (corners.mean(axis=0) - model.links[palm].corners().mean(axis=0))
     return _snapped(line - (line @ axis) * axis)

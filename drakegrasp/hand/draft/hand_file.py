@@ -28,7 +28,7 @@ from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.hand.description import FINGER_DAMPING
 from drakegrasp.hand.draft.fingers import Answers
 from drakegrasp.hand.draft.grips import Finger, Grip, PalmFrame
-from drakegrasp.hand.draft.vendor import VendorModel
+from drakegrasp.hand.draft.vendor import VendorModel, chain_poses
 from drakegrasp.hand.file_format import VERSION
 from drakegrasp.hand.parsing import Mimic
 
@@ -278,12 +278,11 @@ def _effort(model: VendorModel, leader: str, effort: float | None) -> float:
 
 def _levers(model: VendorModel, finger: Finger, step: int) -> tuple[float, dict[str, float]]:
     """Return |dp/dc| and the lever arm of each motor at a step [m/rad, or m/m]."""
-    closing, columns, X = finger.closing, [], np.eye(4)
-    for joint, position in zip(finger.joints, closing.path()[step], strict=True):
-        X_BJ = X @ joint.X_PJ
+    closing, columns = finger.closing, []
+    frames, _ = chain_poses(finger.joints, closing.path()[step])
+    for joint, X_BJ in zip(finger.joints, frames, strict=True):
         axis, arm = X_BJ[:3, :3] @ joint.axis, finger.points[step] - X_BJ[:3, 3]
         columns.append(axis if joint.slides else np.cross(axis, arm))
-        X = X @ joint.pose(float(position))
     motion = (np.array(columns) * closing.gain[:, None]).sum(axis=0)
     along = motion / np.linalg.norm(motion)
 

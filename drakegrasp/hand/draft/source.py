@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
-from xml.etree import ElementTree
 
 import numpy as np
 from pydrake.geometry import Convex
@@ -40,7 +39,8 @@ def read_model(path: Path, packages: Mapping[str, Path] | None = None) -> Vendor
 
     Args:
         path: A URDF, SDFormat or MJCF file.
-        packages: Folders of package:// URIs, in addition to those that contain the model.
+        packages: Folders of package:// URIs by name. Other packages are folders of their name above
+            the model.
 
     Raises:
         HandError: If it is not a tree of rigid links with readable meshes. The message has one
@@ -55,10 +55,9 @@ def read_model(path: Path, packages: Mapping[str, Path] | None = None) -> Vendor
     for name, folder in packages.items():
         if not folder.is_dir():
             raise HandError(f"package {name} must be a folder, got {str(folder)!r}")
-    known = {**_packages_above(path), **packages}
 
     def find(uri: str, base: Path) -> Path:
-        return _file_of(uri, base, path, known)
+        return _file_of(uri, base, path, packages)
 
     if suffix in (".urdf", ".sdf"):
         return _welded(parse_model(path, find))
@@ -66,20 +65,6 @@ def read_model(path: Path, packages: Mapping[str, Path] | None = None) -> Vendor
     from drakegrasp.hand.draft.mujoco_model import compile_model
 
     return _welded(compile_model(path, find))
-
-
-def _packages_above(path: Path) -> dict[str, Path]:
-    """Return the folders above a model that have a `package.xml`, by the name in that file."""
-    found: dict[str, Path] = {}
-    for above in path.resolve().parents:
-        manifest = above / "package.xml"
-        if manifest.is_file():
-            try:
-                name = ElementTree.parse(manifest).findtext("name")
-            except ElementTree.ParseError:
-                name = None
-            found.setdefault((name or above.name).strip(), above)
-    return found
 
 
 def _file_of(uri: str, base: Path, model: Path, packages: Mapping[str, Path]) -> Path:
@@ -94,7 +79,6 @@ def _file_of(uri: str, base: Path, model: Path, packages: Mapping[str, Path]) ->
     if scheme not in ("package", "model"):
         raise HandError(f"model: mesh {uri!r} must be a file, got an address: nothing is fetched")
 
-    # A package is a known one, or a folder of its name above the model.
     name, _, rest = rest.partition("/")
     above = (folder for folder in model.resolve().parents if folder.name == name)
     folder = packages.get(name) or next(above, None)

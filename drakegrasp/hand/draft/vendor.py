@@ -170,14 +170,24 @@ class VendorJoint:
         """Return the poses (..., 4, 4) of the child at positions (...), relative to position 0."""
         return joint_motion(self.axis, positions, slides=self.slides)
 
-    def pose(self, position: float) -> Array:
-        """Return the pose (4, 4) of the joint's moving frame in the parent."""
-        return np.asarray(self.X_PJ @ self.motion(position))
-
     def rebased(self, sign: float, zero: float) -> VendorJoint:
         """Return the joint with positions c instead of q, where q = zero + sign * c."""
         limits = np.sort((self.limits - zero) * sign)
-        return replace(self, X_PJ=self.pose(zero), axis=sign * self.axis, limits=limits)
+        return replace(
+            self, X_PJ=self.X_PJ @ self.motion(zero), axis=sign * self.axis, limits=limits
+        )
+
+
+def chain_poses(joints: Sequence[VendorJoint], q: Array) -> tuple[list[Array], Array]:
+    """Return the poses of joints at positions (..., m) [rad or m], in the parent of the first one.
+
+    They are (..., 4, 4) each: those of the joints' frames, and that of the last joint's child.
+    """
+    X, frames = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4)), []
+    for j, joint in enumerate(joints):
+        frames.append(X @ joint.X_PJ)
+        X = frames[-1] @ joint.motion(q[..., j])
+    return frames, X
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -228,10 +238,9 @@ class VendorModel:
 
     def pose(self, link: str, positions: Mapping[str, float], base: str | None = None) -> Array:
         """Return the pose (4, 4) of a link in a base or the root; joints not given are at 0."""
-        X = np.eye(4)
-        for joint in self.chain(link, base):
-            X = X @ joint.pose(positions.get(joint.name, 0.0))
-        return X
+        joints = self.chain(link, base)
+        q = np.array([positions.get(joint.name, 0.0) for joint in joints])
+        return chain_poses(joints, q)[1]
 
     def mimic(self, joint: str) -> Mimic:
         """Return the leader of a joint, with ratio and offset; by default the joint itself."""
