@@ -32,12 +32,6 @@ def test_a_chain_is_covered_by_every_second_of_its_palms() -> None:
     assert distinct(*(pose(0.015 * k) for k in range(5))) == [True, False, True, False, True]
 
 
-def test_order_decides_how_many_cover_all() -> None:
-    first, middle, last = pose(-0.015), pose(), pose(0.015)
-    assert distinct(first, middle, last) == [True, False, True]
-    assert distinct(middle, first, last) == [True, False, False]
-
-
 @pytest.mark.parametrize(
     ("other", "is_distinct"),
     [

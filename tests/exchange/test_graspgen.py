@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.datasets import OTO
 
+from drakegrasp.cli.arguments import Postures
 from drakegrasp.cli.verify import Target, place
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
@@ -99,13 +101,13 @@ def test_a_verdict_ranks_by_object_and_by_row(out: Path, tmp_path: Path) -> None
     data = GraspDataset(out / OTO, split="train")
     names = data.column("object_props/object_name").tolist()
     path = write(tmp_path / "a.h5", {names[0]: [0.2, 0.9]}, scale=1.0)
-    where: dict[str, Any] = {"dataset": out / OTO, "frame": "object", "link": "palm"}
-    placed, _, rows = place(path, Target(**where))
+    where = Target(dataset=out / OTO, frame="object", reading=Postures(link="palm"))
+    placed, _, rows = place(path, where)
     assert rows is None
     assert [grasp.rank for grasp in placed] == [1, 0]
 
     # As a score has them: both grasps on each row of their object.
-    placed, _, rows = place(path, Target(**where, split="train"))
+    placed, _, rows = place(path, replace(where, split="train"))
     assert rows is not None
     own = [row for row, name in enumerate(names) if name == names[0]]
     assert rows.row.tolist() == own * 2

@@ -1,4 +1,4 @@
-"""A folder for the Hub: `datasets` opens it, and its values are those of dataset and scenes."""
+"""A folder for the Hub: its values are those of the dataset, and its card says what they are."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import yaml
@@ -18,18 +17,11 @@ from helpers.datasets import change
 from PIL import Image
 
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import (
-    DEPTH_UNIT,
-    SCENE_GRASP_FIELDS,
-    SPLITS,
-    VIEW_FIELDS,
-    Field,
-)
+from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS
 from drakegrasp.dataset.statistics import count_splits
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import MachineError
 from drakegrasp.exchange import hub
 from drakegrasp.exchange.export import export_dataset
-from drakegrasp.generation.scenes import make_scenes
 
 pq = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("datasets")
@@ -38,21 +30,6 @@ pytest.importorskip("datasets")
 @pytest.fixture(scope="module")
 def folder(exported: Callable[[str], Path]) -> Path:
     return exported("hf")
-
-
-@pytest.fixture(scope="module")
-def made(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset with scenes."""
-    out = Path(shutil.copytree(dataset, tmp_path_factory.mktemp("scenes") / "out"))
-    make_scenes(out, overrides=["scenes.views=2", "scenes.width=64", "scenes.height=48"])
-    return out
-
-
-@pytest.fixture(scope="module")
-def with_scenes(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    to = tmp_path_factory.mktemp("hub") / "to"
-    export_dataset(made, to, "hf")
-    return to
 
 
 def table_of(folder: Path, config: str, split: str) -> list[dict[str, Any]]:
@@ -83,34 +60,6 @@ def test_rows_are_those_of_the_data_file(
         depth = pixels_of(row["depth"]) * DEPTH_UNIT
         assert np.abs(depth - sample.image[3]).max() <= 0.51 * DEPTH_UNIT
         assert (pixels_of(row["mask"]) == 255 * sample.mask).all()
-
-
-@pytest.mark.sim
-@pytest.mark.parametrize(
-    ("config", "group", "fields"),
-    [("views", "views", VIEW_FIELDS), ("scene_grasps", "grasps", SCENE_GRASP_FIELDS)],
-)
-def test_rows_of_scenes_are_those_of_their_file(
-    made: Path, with_scenes: Path, config: str, group: str, fields: tuple[Field, ...]
-) -> None:
-    """Images, numbers, and what is said of the scene, in the split of the scene."""
-    with h5py.File(made / "scenes.hdf5") as file:
-        own, scenes, names = file[group], file["scenes"], file["objects/name"].asstr()[:]
-        of_rows = scenes["split"][:][own["scene"][:]]
-        for number, split in enumerate(SPLITS):
-            found = table_of(with_scenes, config, split)
-            places = np.flatnonzero(of_rows == number)
-            assert len(found) == len(places) > 0 or split == "valid"
-            for row, i in zip(found, places, strict=True):
-                scene = row["scene"]
-                assert row["object_name"] == [names[scenes["object"][scene, 0]]]
-                assert row["X_TO"] == scenes["X_TO"][scene].tolist()
-                for field in fields:
-                    if field.name not in own:  # an optional column
-                        continue
-                    value = row["image" if field.name == "rgb" else field.name]
-                    value = pixels_of(value) if field.sample else value
-                    np.testing.assert_array_equal(value, own[field.name][i], err_msg=field.name)
 
 
 def test_card_names_licence_files_and_samples(dataset: Path, folder: Path) -> None:
@@ -147,16 +96,6 @@ def test_seeds_of_64_bits_are_exported(dataset: Path, tmp_path: Path) -> None:
     change(out, "grasping_oto.hdf5", "test/conditions/depth_seed", 0, lambda _: 2**64 - 1)
     export_dataset(out, tmp_path / "to", "hf")
     assert table_of(tmp_path / "to", "oto", "test")[0]["depth_seed"] == 2**64 - 1
-
-
-@pytest.mark.sim
-def test_scenes_of_other_trials_are_refused(made: Path, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(made, tmp_path / "out"))
-    with h5py.File(out / "scenes.hdf5", "r+") as file:
-        file.attrs["shards"] = "others"
-    with pytest.raises(DataError, match="must be of the trials in its folder, got other scenes"):
-        export_dataset(out, tmp_path / "to", "hf")
-    assert not (tmp_path / "to").exists()
 
 
 def test_missing_datasets_is_one_line(

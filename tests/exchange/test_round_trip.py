@@ -38,7 +38,6 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.scoring.run import VERDICTS
-from drakegrasp.simulation.attempts import CONDITIONS
 from drakegrasp.simulation.posture import joint_order
 
 NAME, HAND = "1_brick_a", "allegro_four"
@@ -253,30 +252,3 @@ def test_what_names_no_resting_pose_is_tried_in_all_and_the_best_is_told(
         (row, k) for row in range(len(samples)) for k in range(poses)
     ]
     assert check_dataset(again) == []
-
-
-@pytest.mark.sim
-@pytest.mark.nightly
-def test_palms_on_exported_meshes_are_the_same_trials(
-    out: Path, samples: Trials, written: Callable[[str], Path], tmp_path: Path
-) -> None:
-    """Of the palm link, of samples in the third resting pose and of another."""
-    folder, hand = written("meshes"), load_hand(HAND)
-    chosen = [*np.flatnonzero(samples["resting"] == 2)[:2], 0]
-    X_OB = unpack_pose(samples["X_OG"]) @ np.linalg.inv(hand.X_BG)
-    np.savez(
-        tmp_path / "palms.npz",
-        X_FG=X_OB[chosen],
-        object=[NAME] * len(chosen),
-        row=np.array(chosen, dtype=np.int64),
-        preshape=[hand.preshape_names[samples["preshape"][i]] for i in chosen],
-        **{name: samples[name][chosen] for name in ("resting", *CONDITIONS)},
-    )
-
-    # On the rows of the dataset, and on the mesh that was exported, of whose unit nothing is said.
-    rules = [word for rule in (*RULES, *OBJECTS) for word in ("--set", rule)]
-    onto = ("--object", folder / f"{NAME}.obj", "--frame", "mesh", "--config", "fast", *rules)
-    for where in (("--dataset", out / OTO, "--split", "train"), onto):
-        found = verified(tmp_path / "palms.npz", *where, "--link", hand.palm_link)
-        assert [v["outcome"] for v in found] == ["success"] * len(chosen)
-        np.testing.assert_allclose([v["slip"] for v in found], samples["slip"][chosen], rtol=0.1)
