@@ -124,7 +124,7 @@ def _better_place(grasp: PlacedGrasp, given: Table) -> str:
         "": grasp.X_OA,
         "the object's frame (object)": np.eye(4),
         "the table's frame (table)": X_OT,
-        "the world's frame": multiply(X_OT, invert_pose(X_WT)),
+        "the world's frame (world)": multiply(X_OT, invert_pose(X_WT)),
         "the mesh file's frame (mesh)": model.X_OM,
         **{name: multiply(X_OT, X_TC) for name, X_TC in grasp.cameras.items()},
     }
@@ -157,9 +157,7 @@ def _better_order(grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array) -> tuple[int
         others, key=lambda order: posture_misfit(postures, p_OQ[[*order]], nhat_Q_O[[*order]])
     )
     reach = {
-        order: fit_wrist(
-            hand, p_OQ[[*order]], nhat_Q_O[[*order]], up_O=X_TO[2, :3], height=float(X_TO[2, 3])
-        )[0].objective
+        order: fit_wrist(hand, p_OQ[[*order]], nhat_Q_O[[*order]], X_TO)[0].objective
         for order in (given, *likely[:MOST_ORDERS])
     }
     best = min(reach, key=lambda order: reach[order])

@@ -75,13 +75,8 @@ def rounded(p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
 @one_thread
 def first_fit(grasp: PlacedGrasp) -> WristFit:
     """Return the wrist pose by which valid contacts are judged."""
-    return _wrist_poses(grasp, *rounded(*grasp.in_object_frame()))[0]
-
-
-def _wrist_poses(grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array) -> list[WristFit]:
-    """Return the wrist poses that bring the fingertips to contacts, the best first."""
-    X_TO, hand = grasp.placed.X_TO_simulated, load_hand(grasp.config.hand_source)
-    return fit_wrist(hand, p_OQ, nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3]))
+    hand, contacts = load_hand(grasp.config.hand_source), rounded(*grasp.in_object_frame())
+    return fit_wrist(hand, *contacts, grasp.placed.X_TO_simulated)[0]
 
 
 def _of_contacts(verdict: Verification) -> Verification:
@@ -91,7 +86,8 @@ def _of_contacts(verdict: Verification) -> Verification:
     with timed(seconds, "surface"):
         surface = fit_surface(grasp.placed.model, p_OQ, nhat_Q_O)
     with timed(seconds, "fit"):
-        poses = _wrist_poses(grasp, p_OQ, nhat_Q_O)
+        hand = load_hand(grasp.config.hand_source)
+        poses = fit_wrist(hand, p_OQ, nhat_Q_O, grasp.placed.X_TO_simulated)
 
     # Two contacts leave the palm's turn about their line open, and most of these poses are inside
     # the object or the table: the first clear pose counts as the first pose, unless all collide.

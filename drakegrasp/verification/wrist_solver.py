@@ -275,17 +275,14 @@ class WristFit:
     normal_error: Array
 
 
-def fit_wrist(
-    hand: Hand, p_OQ: Array, nhat_Q_O: Array, *, up_O: Array, height: float
-) -> list[WristFit]:
+def fit_wrist(hand: Hand, p_OQ: Array, nhat_Q_O: Array, X_TO: Array) -> list[WristFit]:
     """Return the solutions from all starts, the one with the smallest objective first.
 
     Args:
         hand: A hand with k fingers.
         p_OQ: (k, 3), contact points [m].
         nhat_Q_O: (k, 3), outward unit normals.
-        up_O: (3,), the table's upward normal in {O}.
-        height: Height of the origin of {O} above the table [m].
+        X_TO: (4, 4), pose of the object on the table, under which the hand cannot be.
     """
     constants, fits = hand_constants(hand), []
     starts = find_starts(make_postures(hand), p_OQ, nhat_Q_O, STARTS)
@@ -296,8 +293,8 @@ def fit_wrist(
             constants=constants,
             p_OQ=p_OQ,
             nhat_Q_O=nhat_Q_O,
-            up_O=up_O,
-            height=height,
+            up_O=X_TO[2, :3],
+            height=float(X_TO[2, 3]),
             X_OS=X_OS,
             posture=posture,
         )

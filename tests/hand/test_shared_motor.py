@@ -9,6 +9,7 @@ import pytest
 from helpers.hands import SLIDER, slider_fingers, write_slider
 
 from drakegrasp.errors import HandError
+from drakegrasp.frames import make_pose
 from drakegrasp.hand.checks import check_couplings
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import (
@@ -95,7 +96,7 @@ def test_a_wrist_brings_both_fingers_to_their_points(tmp_path: Path) -> None:
     assert make_postures(hand).coordinates.shape[1] == 2
     p_OQ, outward = np.array([[0.0, -0.017, 0.3], [0.0, 0.023, 0.3]]), np.eye(3)[[1, 1]]
     outward[0] *= -1.0
-    best = fit_wrist(hand, p_OQ, outward, up_O=np.array([0.0, 0.0, 1.0]), height=0.5)[0]
+    best = fit_wrist(hand, p_OQ, outward, make_pose(np.eye(3), [0.0, 0.0, 0.5]))[0]
     assert best.closing[0] == best.closing[1] == pytest.approx(0.02, abs=1e-3)
     assert best.residual.max() < 5e-4
 

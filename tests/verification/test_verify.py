@@ -143,6 +143,7 @@ def test_start_collision_names_the_links_and_what_they_are_in(cube, grasp):
     ("meant", "given", "factor", "hint"),
     [
         ("table", {"frame": "object"}, 1.0, "the table's frame (table)"),
+        ("world", {"frame": "table"}, 1.0, "the world's frame (world)"),
         ("object", {"frame": "table"}, 1.0, "the object's frame (object)"),
         ("object", {"frame": "camera", "X_TC": X_TC}, 1.0, "the object's frame (object)"),
         (X_TC, {"frame": "camera", "X_TC": invert_pose(X_TC)}, 1.0, "the inverse of X_TC"),
@@ -170,7 +171,11 @@ def test_misplaced_points_are_told_first_with_where_they_would_fit(
 ) -> None:
     # Of a cube that stands upright in the middle, the frames differ by their height alone.
     X_TO = make_pose(Rotation.from_euler("z", 0.7).as_matrix(), [0.2, -0.1, 0.0]) @ cube.X_TO
-    X_FO = {"object": np.eye(4), "table": X_TO}[meant] if isinstance(meant, str) else None
+    X_FO = (
+        {"object": np.eye(4), "table": X_TO, "world": X_WT @ X_TO}[meant]
+        if isinstance(meant, str)
+        else None
+    )
     X_FO = invert_pose(X_TC) @ X_TO if X_FO is None else X_FO
     numbers = dg.transform_grasp(X_FO, dg.pack_grasp(*grasp))
     numbers[:9] *= factor

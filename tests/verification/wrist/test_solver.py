@@ -83,7 +83,7 @@ def touched(name, seed, *, scatter=0.005, closing_deg=(20, 100)):
 
 
 def fit(hand, contacts, height=HIGH):
-    return fit_wrist(hand, *contacts, up_O=UP, height=height)
+    return fit_wrist(hand, *contacts, make_pose(np.eye(3), [0.0, 0.0, height]))
 
 
 def lowest(hand, found, height):
