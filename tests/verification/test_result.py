@@ -44,57 +44,44 @@ def lifted(*, slip_mm, turn_deg, links, outcome=Outcome.SUCCESS):
     return some_verdict(model, outcome=outcome, tries=(some_try(trial, removal=removal),))
 
 
+TIPS_ALONE, ANOTHER = "no other link of the hand touches it", "another link touches it"
+
+
 @pytest.mark.parametrize(
-    ("slip_mm", "turn_deg", "links", "precision", "stable"),
+    ("slip_mm", "turn_deg", "links", "stable", "said"),
     [
-        (0.2, 0.3, 0, True, True),
-        (4.9, 4.9, 0, True, True),
-        (5.1, 0.3, 0, True, False),
-        (0.2, 5.1, 0, True, False),
-        (0.2, 0.3, 1, False, False),
-        (73.0, 98.0, 1, False, False),
+        (0.2, 0.3, 0, True, f"{TIPS_ALONE}: a precision grasp, stable."),
+        (4.9, 4.9, 0, True, f"{TIPS_ALONE}: a precision grasp, stable."),
+        (5.1, 0.3, 0, False, f"{TIPS_ALONE}: a precision grasp, not stable."),
+        (0.2, 5.1, 0, False, f"{TIPS_ALONE}: a precision grasp, not stable."),
+        (0.2, 0.3, 1, False, f"{ANOTHER}: no precision grasp, not stable."),
+        (73.0, 98.0, 2, False, "2 other links touch it: no precision grasp, not stable."),
     ],
 )
-def test_words_follow_from_slip_turn_and_other_links(slip_mm, turn_deg, links, precision, stable):
+def test_words_and_sentences_follow_from_slip_turn_and_other_links(
+    slip_mm, turn_deg, links, stable, said
+):
     verdict = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links)
     assert verdict.held is verdict.success is True
-    assert (verdict.precision, verdict.stable, verdict.sample) == (precision, stable, precision)
+    assert (verdict.precision, verdict.stable, verdict.sample) == (not links, stable, not links)
     assert repr(verdict) == "Verification(success: so it is)"
+    text, load = verdict.explain(), "1.0 N, 0.1 times the hand's rated load of 19.6 N."
+    moved = f"slips by {slip_mm:.1f} mm and turns by {turn_deg:.1f}° in the hand"
+    assert text.startswith("The grasp of vase holds: so it is. Before closing, the fingertips are ")
+    assert f" During the lift the object {moved}, and at the end {said} In a dataset" in text
+    assert f"The largest force of a fingertip is {load}" in text
 
 
-def test_grasp_that_fails_is_none_of_the_words():
-    verdict = lifted(slip_mm=0.0, turn_deg=0.0, links=0, outcome=Outcome.SLIPPED)
+def test_grasp_that_fails_is_none_of_the_words_and_gets_no_mark():
+    verdict = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED)
     assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
+    text = verdict.explain()
+    assert text.startswith("The grasp of vase fails (dropped): so it is. ")
+    assert text.endswith("touches it; 3 of 3 fingertips still touch it.")
     # What was not lifted is nothing, either.
     verdict = replace(verdict, tries=(), outcome=Outcome.INVALID)
     assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
     assert "slips" not in verdict.explain()
-
-
-@pytest.mark.parametrize(
-    ("slip_mm", "turn_deg", "links", "said"),
-    [
-        (0.2, 0.3, 0, "no other link of the hand touches it: a precision grasp, stable."),
-        (9.0, 0.3, 0, "no other link of the hand touches it: a precision grasp, not stable."),
-        (73.0, 98.0, 1, "another link touches it: no precision grasp, not stable."),
-        (73.0, 98.0, 2, "2 other links touch it: no precision grasp, not stable."),
-    ],
-)
-def test_explanation_tells_what_moved_and_what_touched(slip_mm, turn_deg, links, said):
-    text = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links).explain()
-    moved = f"slips by {slip_mm:.1f} mm and turns by {turn_deg:.1f}° in the hand"
-    assert text.startswith("The grasp of vase holds: so it is. Before closing, the fingertips are ")
-    assert f" During the lift the object {moved}, and at the end {said} In a dataset" in text
-    assert (
-        "The largest force of a fingertip is 1.0 N, 0.1 times the hand's rated load of 19.6 N."
-        in text
-    )
-
-
-def test_explanation_of_a_lost_object_gives_no_mark():
-    text = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED).explain()
-    assert text.startswith("The grasp of vase fails (dropped): so it is. ")
-    assert text.endswith("touches it; 3 of 3 fingertips still touch it.")
 
 
 @pytest.mark.parametrize(
