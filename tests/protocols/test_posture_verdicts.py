@@ -282,6 +282,8 @@ def test_bad_part_of_an_object_or_none_costs_only_its_grasps(
 def test_object_without_parts_or_volume_is_refused(tmp_path: Path, assets: Path) -> None:
     with pytest.raises(DataError, match="must hold the object's convex parts"):
         read_object_folder(tmp_path / "none", 1.0)
+    one, half = (read_object_folder(assets / "box", scale).volume for scale in (1.0, 0.5))
+    assert half == pytest.approx(one / 8.0)
     (assets / "box/info/simplified.json").write_text("{}")
     with pytest.raises(DataError, match="must have mass, density and scale"):
         read_object_folder(assets / "box", 1.0)

@@ -105,6 +105,12 @@ def test_a_score_by_other_rules_is_not_frozen(tmp_path, monkeypatch):
         assert about["frozen"] == (other == "")
         assert other in about["other_settings"]
 
+    # Nor is one of other meshes.
+    monkeypatch.setattr(benchmark, "wavefront", lambda mesh: b"v 0 0 0\n")
+    about = read_benchmark(made(tmp_path / "other"), SCORED, {})
+    assert about is not None
+    assert not about["frozen"] and about["other_settings"] == ""
+
 
 @pytest.mark.parametrize("manifest", [True, False])
 def test_a_folder_of_something_else_stays_as_it_is(tmp_path, manifest):

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.depth_images import X_TC, K, box_view, cloud_of
 
 import drakegrasp as dg
+from drakegrasp.scoring import ranking
 from drakegrasp.scoring.predicting import _predict_view, _SceneView, predict
+from drakegrasp.simulation.attempt import Attempt
 
 CONFIG = dg.load_config("fast", ["objects.mass=0.3"])
 
@@ -54,6 +57,22 @@ def test_lifts_end_at_the_first_grasp_that_holds_in_all_of_them(cloud, view):
     again = dg.rank(proposed, cloud, simulate=8, view=tuple(view), config=CONFIG)
     np.testing.assert_array_equal(again.share, seen.share)
     assert dg.rank(proposed, cloud, simulate=1, config=CONFIG).completion == "cloud"
+
+
+@pytest.mark.sim
+def test_a_share_is_of_all_lifts_of_a_grasp(monkeypatch):
+    """On both solids, then with the palm 4 mm aside and with less friction on the first."""
+    placed, starts = dg.place_object(trimesh.creation.box([0.06] * 3)), list[Attempt]()
+
+    def is_sample(placed, start):
+        starts.append(start)
+        return start.conditions is None
+
+    monkeypatch.setattr(ranking, "_is_sample", is_sample)
+    assert ranking.lift_shares(
+        [placed, placed], [Attempt(X_OG=np.eye(4), spread=0.0)]
+    ).tolist() == [0.8]
+    assert [start.X_OG[0, 3] for start in starts] == [0.0, 0.0, 0.004, -0.004, 0.0]
 
 
 @pytest.mark.sim
