@@ -188,8 +188,8 @@ class DatasetTask:
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """Files of the dataset that the task reads, without those of the hand."""
-        raise NotImplementedError
+        """Files of the dataset that the task reads if they exist, without those of the hand."""
+        return self.outputs
 
     @property
     def outputs(self) -> tuple[Path, ...]:

@@ -251,10 +251,10 @@ class _Build:
         unexplained = tuple(counts.unexplained())
         for line in unexplained:
             self._say(line)
-        done = {"simulated": counts.simulated, "reused": counts.reused}
         return BuildReport(
             out=self._out,
-            **done,
+            simulated=counts.simulated,
+            reused=counts.reused,
             objects=len(self._manifest.objects),
             refused=self._manifest.refused,
             errors=dict(counts.errors),
@@ -282,7 +282,6 @@ class _Build:
         manifest = self._manifest
         before: dict[str, ObjectEntry | RefusedMesh] = {e.name: e for e in manifest.objects}
         before |= {entry.name: entry for entry in manifest.refused}
-
         entries = self._entries(sources, before, report)
 
         # If a mesh has changed, its rows and its rejected grasps no longer exist.
@@ -423,9 +422,7 @@ class _Build:
     def _outliers(self, manifest: Manifest) -> dict[str, int]:
         """Return how many samples of each object the filter of outliers removes."""
         filters, names = self._config.filters, [entry.name for entry in manifest.objects]
-        if filters.outlier_sigma == 0.0:
-            return {}
-        if not manifest.units:
+        if filters.outlier_sigma == 0.0 or not manifest.units:
             return {}
         self._survey = survey(self._out, manifest, self._successes)
         successes = self._survey.successes

@@ -63,11 +63,6 @@ class PrepareTask(DatasetTask):
         return *object_files(self.out, self.source.name), self.journal
 
     @property
-    def inputs(self) -> tuple[Path, ...]:
-        """The files of an earlier run."""
-        return self.outputs
-
-    @property
     def _mesh_place(self) -> str:
         # Messages name the file, so the copy keeps its name.
         return f"meshes/{self.source.name}/{self.source.path.name}"
@@ -98,11 +93,6 @@ class DrawTask(DatasetTask):
     def outputs(self) -> tuple[Path, ...]:
         """The object's files."""
         return object_files(self.out, self.name)
-
-    @property
-    def inputs(self) -> tuple[Path, ...]:
-        """The object's files."""
-        return self.outputs
 
 
 @one_thread

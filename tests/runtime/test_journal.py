@@ -166,6 +166,12 @@ def test_unit_that_another_process_is_at_is_not_a_dead_one(tmp_path: Path) -> No
         assert (tmp_path / "journal").exists()
 
 
+def test_process_that_nobody_restarts_keeps_no_journal(tmp_path: Path) -> None:
+    with open_journal(tmp_path / "journal", UNIT, restartable=False) as journal:
+        assert journal is NO_JOURNAL
+        assert not list(tmp_path.iterdir())
+
+
 def test_kill_leaves_a_journal_without_a_mark(tmp_path: Path) -> None:
     path = tmp_path / "journal"
     process = subprocess.Popen(
