@@ -74,7 +74,7 @@ def cluster_of(kind: str, own: Sequence[str] = (), **options: Any) -> Local:
     """
     found = registry.find("clusters", kind)
     if hasattr(found, "job_cls"):  # of dask-jobqueue, which may not be installed
-        found = jobs_of(found)
+        found = type(found.__name__, (Jobs,), {"of": found})
     if not (isinstance(found, type) and issubclass(found, Local)):
         raise ConfigError(f"clusters: {kind} must be a subclass of Local, got {found!r}")
     given = {}
@@ -359,12 +359,6 @@ class Jobs(Local):
             cluster.close()
             raise
         return cluster
-
-
-def jobs_of(cluster: type[Any]) -> type[Jobs]:
-    """Return the kind whose jobs are those of a class of dask-jobqueue."""
-    kind: type[Jobs] = type(cluster.__name__, (Jobs,), {"of": cluster})
-    return kind
 
 
 def _value(text: str) -> Any:

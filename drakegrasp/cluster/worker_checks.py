@@ -83,8 +83,9 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
         if self._shared is not None and not self._shared.is_seen():
             fault = f"must see {self._shared.probe.parent} like those at the start"
         if fault is None:
-            theirs = {**self._versions, **_own_versions(self._config, travels=self._travels)}
-            fault = unfitness(worker.state.nthreads, theirs, self._versions)
+            fault = unfitness(
+                self._config, self._versions, travels=self._travels, dask_worker=worker
+            )
         if fault is None and _host() not in self._hosts:
             fault = _image_fault()
         if fault is not None:
@@ -116,9 +117,8 @@ def checked_workers(
 
         # Reject workers that the user must change. A hand that is sent has the client's version.
         versions = installed_versions(config)
-        theirs = client.run(_own_versions, config, travels=travels)
-        for address, threads in client.nthreads().items():
-            fault = unfitness(threads, {**versions, **theirs.get(address, {})}, versions)
+        faults = client.run(unfitness, config, versions, travels=travels)
+        for address, fault in faults.items():
             if fault is not None:
                 raise MachineError(f"worker {address}: {fault}")
 
@@ -170,23 +170,27 @@ def _must_travel(client: Client, shared: Shared) -> bool:
     return True
 
 
-def _own_versions(config: Config, *, travels: bool) -> dict[str, str]:
-    """Return the versions of this process, without the hand's version if its files are sent."""
-    if travels:
-        return package_versions()
-    try:
-        return installed_versions(config)
-    except HandError as error:
-        return {**package_versions(), "hand": f"none ({error})"}
+def unfitness(
+    config: Config, ours: Mapping[str, str], *, travels: bool, dask_worker: Worker
+) -> str | None:
+    """Return why a worker must not work, or None if it may; called in the worker.
 
-
-def unfitness(threads: int, theirs: Mapping[str, str], ours: Mapping[str, str]) -> str | None:
-    """Return why a worker with these threads and versions must not work, or None if it may."""
+    Args:
+        config: Configuration, whose hand is among the versions unless its files are sent.
+        ours: Versions of the client.
+        travels: Whether the worker gets the hand's files from the client.
+        dask_worker: The worker.
+    """
+    threads = dask_worker.state.nthreads
     if threads != 1:
         return (
             "must have one thread (dask worker --nthreads 1), because OpenGL renders in one "
             f"thread of a process only, got {threads}"
         )
+    try:
+        theirs = {**ours, **(package_versions() if travels else installed_versions(config))}
+    except HandError as error:
+        theirs = {**package_versions(), "hand": f"none ({error})"}
     for name in REQUIRED_VERSIONS:
         if theirs[name] != ours[name]:
             return f"must have {name} {ours[name]} like the client, got {theirs[name]}"

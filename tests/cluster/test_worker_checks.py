@@ -1,4 +1,4 @@
-"""Machines that cannot render do no work."""
+"""Workers of several threads and machines that cannot render do no work."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import os
 import socket
 
 import pytest
-from distributed import Worker
+from distributed import Client, Worker
+from server.processes import small_cluster
 
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.worker_checks import checked_workers
@@ -33,6 +34,16 @@ def _lose_the_driver() -> None:
 
 def _name(dask_worker: Worker) -> str:
     return str(dask_worker.name)
+
+
+def test_worker_of_several_threads_is_refused_at_the_start() -> None:
+    with (
+        small_cluster(1, threads=2) as cluster,
+        Client(cluster) as client,
+        pytest.raises(MachineError, match=r"^worker inproc://.*: must have one thread .*, got 2$"),
+        checked_workers(client, load_config()),
+    ):
+        raise AssertionError
 
 
 @pytest.mark.nightly

@@ -57,10 +57,10 @@ def wait_until(ready: Callable[[], bool], what: str, log: Path) -> None:
         time.sleep(0.2)
 
 
-def small_cluster(workers: int) -> LocalCluster:
+def small_cluster(workers: int, threads: int = 1) -> LocalCluster:
     """Return a Dask cluster in this process."""
-    there = {"threads_per_worker": 1, "processes": False, "dashboard_address": "127.0.0.1:0"}
-    return LocalCluster(n_workers=workers, **there)
+    there = {"processes": False, "dashboard_address": "127.0.0.1:0"}
+    return LocalCluster(n_workers=workers, threads_per_worker=threads, **there)
 
 
 @contextmanager
