@@ -42,20 +42,6 @@ FOLDED = -0.9998
 FLAT, FLAT_STEPS = 1e-6, 8
 #: What NumPy says, in a warning or an error, when it stops at a word that is not a number.
 _NO_NUMBER = "string or file could not be read"
-
-
-def load_points(path: Path) -> Array:
-    """Return the points (n, 3) of a PLY file without faces, in the file's units and axes.
-
-    Raises:
-        MeshError: If the file cannot be read or holds something else.
-    """
-    clouds = list(_parse_scene(path.name, read_bytes(path)).geometry.values())
-    if len(clouds) != 1 or not isinstance(clouds[0], trimesh.PointCloud):
-        raise MeshError(f"{path.name}: must hold points, got a mesh: sample its surface")
-    return np.asarray(clouds[0].vertices, dtype=np.float64)
-
-
 #: Extensions of glTF that are read. Others are refused if they are required or change the shape,
 #: unless a part of their names says that they change the look alone.
 _READ = ("KHR_mesh_quantization", "material", "texture", "light")
@@ -79,6 +65,18 @@ def load_surface(path: Path) -> tuple[Array, Faces]:
     vertices, faces = join_scene(_parse_scene(path.name, read_bytes(path)))
     validate_triangles(vertices, faces, path.name)
     return vertices, faces
+
+
+def load_points(path: Path) -> Array:
+    """Return the points (n, 3) of a PLY file without faces, in the file's units and axes.
+
+    Raises:
+        MeshError: If the file cannot be read or holds something else.
+    """
+    clouds = list(_parse_scene(path.name, read_bytes(path)).geometry.values())
+    if len(clouds) != 1 or not isinstance(clouds[0], trimesh.PointCloud):
+        raise MeshError(f"{path.name}: must hold points, got a mesh: sample its surface")
+    return np.asarray(clouds[0].vertices, dtype=np.float64)
 
 
 def read_bytes(path: Path) -> bytes:

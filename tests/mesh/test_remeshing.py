@@ -206,13 +206,6 @@ def test_base_that_is_plane_to_micrometres_is_one_facet() -> None:
     assert signed_volume(hull.vertices, hull.faces) == pytest.approx(mesh.volume, rel=1e-3)
 
 
-def test_ring_gets_a_disc_as_its_base() -> None:
-    ring = trimesh.creation.annulus(r_min=0.03, r_max=0.04, height=0.02, sections=32)
-    hull = resting_hull(np.asarray(ring.vertices))
-    expected = trimesh.creation.cylinder(radius=0.04, height=0.02, sections=32).volume
-    assert signed_volume(hull.vertices, hull.faces) == pytest.approx(expected, rel=1e-6)
-
-
 #: More faces than any solid here can need.
 PLENTY = 10**6
 
