@@ -305,16 +305,6 @@ def _make(out: Path, meshes: Path, overrides: tuple[str, ...]) -> Path:
     return out
 
 
-def end_lift(out: Path, row: int, slip: float) -> None:
-    """Let the lift of a row of /trials be one that was ended, after the object slid so far."""
-    with h5py.File(out / TRIALS, "r+") as file:
-        trials = file["trials"]
-        turn = make_pose(rotation_about([0, 0, 1], np.deg2rad(1.0)), [0.0, 0.0, slip])
-        X_OG = unpack_pose(trials["X_OG"][row])
-        trials["X_OG_lifted"][row] = pack_pose(X_OG @ invert_pose(turn))
-        trials["slip"][row], trials["outcome"][row] = slip, Outcome.MOVED
-
-
 Edit = Callable[[np.ndarray], Any]
 
 
@@ -344,12 +334,6 @@ def moved(*by: float) -> Edit:
         return values
 
     return edit
-
-
-def turned(angle: float, axis: list[float]) -> Edit:
-    """Turn a packed pose about an axis of its own."""
-    turn = trimesh.transformations.rotation_matrix(angle, axis)
-    return lambda values: pack_pose(unpack_pose(values) @ turn)
 
 
 def mirrored(values: np.ndarray) -> np.ndarray:
