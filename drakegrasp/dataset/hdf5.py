@@ -24,18 +24,12 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.schema import (
     CAMERAS,
-    DATA_FIELDS,
+    DATA_TABLES,
     LETTERS,
-    OBJECT_FIELDS,
-    SCENE_FIELDS,
-    SCENE_GRASP_FIELDS,
-    SCENE_OBJECT_FIELDS,
-    SPLITS,
-    SUCCESS_FIELDS,
-    TRIAL_FIELDS,
-    VIEW_FIELDS,
-    VISIBLE_FIELDS,
+    SCENE_TABLES,
+    TRIAL_TABLES,
     Field,
+    Tables,
     validate_schema_version,
 )
 from drakegrasp.errors import DataError, first_line, printable
@@ -54,21 +48,6 @@ MOST_PACKED = 1_032
 GZIP_LEVEL = 1
 #: Number of rows in a chunk of a column of small values.
 COLUMN_CHUNK = 2048
-#: Fields of each group of a file, by the group's name.
-Tables = Mapping[str, tuple[Field, ...]]
-DATA_TABLES: Tables = {split: DATA_FIELDS for split in SPLITS}
-TRIAL_TABLES: Tables = {
-    "objects": OBJECT_FIELDS,
-    "trials": TRIAL_FIELDS,
-    "successes": SUCCESS_FIELDS,
-}
-SCENE_TABLES: Tables = {
-    "objects": SCENE_OBJECT_FIELDS,
-    "scenes": SCENE_FIELDS,
-    "views": VIEW_FIELDS,
-    "grasps": SCENE_GRASP_FIELDS,
-    "visible": VISIBLE_FIELDS,
-}
 
 
 # Files

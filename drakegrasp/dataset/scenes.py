@@ -23,7 +23,6 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.dataset.hdf5 import (
-    SCENE_TABLES,
     AnyArray,
     ImageRows,
     open_scenes,
@@ -33,7 +32,7 @@ from drakegrasp.dataset.hdf5 import (
     validate_codes,
 )
 from drakegrasp.dataset.reader import GraspDataset, emptiness_of
-from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SPLITS
+from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SCENE_TABLES, SPLITS
 from drakegrasp.dataset.trials import Trials, reopened, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json, validate_local

@@ -735,3 +735,19 @@ PREDICTED_ROW_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "int64", "row of trials.hdf5 of the same sample"),
 )
 # fmt: on
+
+#: Fields of each group of a file, by the group's name.
+Tables = Mapping[str, tuple[Field, ...]]
+DATA_TABLES: Tables = {split: DATA_FIELDS for split in SPLITS}
+TRIAL_TABLES: Tables = {
+    "objects": OBJECT_FIELDS,
+    "trials": TRIAL_FIELDS,
+    "successes": SUCCESS_FIELDS,
+}
+SCENE_TABLES: Tables = {
+    "objects": SCENE_OBJECT_FIELDS,
+    "scenes": SCENE_FIELDS,
+    "views": VIEW_FIELDS,
+    "grasps": SCENE_GRASP_FIELDS,
+    "visible": VISIBLE_FIELDS,
+}

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import (
-    SCENE_TABLES,
     AnyArray,
     create_field,
     open_samples,
@@ -36,6 +35,7 @@ from drakegrasp.dataset.schema import (
     DEPTH_UNIT,
     NO_PRESHAPE,
     SCENE_GRASP_FIELDS,
+    SCENE_TABLES,
     SPLITS,
     SURFACE_POINTS,
     VIEW_FIELDS,

@@ -10,29 +10,13 @@ from collections.abc import Iterable, Sequence
 
 import generated_page
 
-from drakegrasp.dataset.schema import (
-    CONVENTIONS,
-    DATA_FIELDS,
-    LOOK_FIELDS,
-    OBJECT_FIELDS,
-    PREDICTED_ROW_FIELDS,
-    SCENE_FIELDS,
-    SCENE_GRASP_FIELDS,
-    SCENE_OBJECT_FIELDS,
-    SCHEMA_VERSION,
-    SUCCESS_FIELDS,
-    TRIAL_FIELDS,
-    VERIFICATION_FIELDS,
-    VIEW_FIELDS,
-    VISIBLE_FIELDS,
-    Field,
-)
+from drakegrasp.dataset import schema
 
 _HEAD = f"""<!-- Made by `make docs-pages` from dataset/schema.py: change that, not this. -->
 
 # The dataset's format
 
-Schema version {SCHEMA_VERSION}. In the shapes, `N` is the number of rows, `k` the number of
+Schema version {schema.SCHEMA_VERSION}. In the shapes, `N` is the number of rows, `k` the number of
 fingers, `j` the number of the hand's joints, `6k` the length of a grasp (18 for three fingers) and
 `S` the edge length of the images. In `scenes.hdf5`, `h` and `w` are the height and width of the
 images, and `o` is the number of objects in a scene. Frames are explained in
@@ -202,42 +186,32 @@ success:
 """
 
 
+#: What introduces a table of fields, the fields, and whether the stage is told from which they
+#: have values.
+_TABLES = (
+    (_DATA, schema.DATA_FIELDS, False),
+    ("\n## trials.hdf5\n\n### /trials\n", schema.TRIAL_FIELDS, True),
+    ("\n### /objects\n", schema.OBJECT_FIELDS, False),
+    ("\n### /successes\n", schema.SUCCESS_FIELDS, False),
+    (_SCENES, schema.SCENE_FIELDS, False),
+    ("\n### /views\n", schema.VIEW_FIELDS, False),
+    ("\n### /grasps\n", schema.SCENE_GRASP_FIELDS, False),
+    ("\n### /visible\n", schema.VISIBLE_FIELDS, False),
+    ("\n### /objects of scenes.hdf5\n", schema.SCENE_OBJECT_FIELDS, False),
+    (_SHARDS, schema.LOOK_FIELDS, False),
+    (_VERIFICATION, schema.VERIFICATION_FIELDS, True),
+    (_ROWS, schema.PREDICTED_ROW_FIELDS, False),
+)
+
+
 def format_page() -> str:
     """Return the page as Markdown."""
-    return "\n".join(
-        [
-            _HEAD,
-            "## Conventions\n\nThey are in every file as attributes `convention_*`.\n",
-            _table(("attribute", "text"), CONVENTIONS.items()),
-            _ATTRIBUTES,
-            _DATA,
-            _fields(DATA_FIELDS),
-            "\n## trials.hdf5\n\n### /trials\n",
-            _fields(TRIAL_FIELDS, stages=True),
-            "\n### /objects\n",
-            _fields(OBJECT_FIELDS),
-            "\n### /successes\n",
-            _fields(SUCCESS_FIELDS),
-            _SCENES,
-            _fields(SCENE_FIELDS),
-            "\n### /views\n",
-            _fields(VIEW_FIELDS),
-            "\n### /grasps\n",
-            _fields(SCENE_GRASP_FIELDS),
-            "\n### /visible\n",
-            _fields(VISIBLE_FIELDS),
-            "\n### /objects of scenes.hdf5\n",
-            _fields(SCENE_OBJECT_FIELDS),
-            _SHARDS,
-            _fields(LOOK_FIELDS),
-            _VERIFICATION,
-            _fields(VERIFICATION_FIELDS, stages=True),
-            _ROWS,
-            _fields(PREDICTED_ROW_FIELDS),
-            _LINES,
-            "\n" + _CONTRACT,
-        ]
-    )
+    conventions = "## Conventions\n\nThey are in every file as attributes `convention_*`.\n"
+    parts = [_HEAD, conventions, _table(("attribute", "text"), schema.CONVENTIONS.items())]
+    parts.append(_ATTRIBUTES)
+    for head, fields, stages in _TABLES:
+        parts += [head, _fields(fields, stages=stages)]
+    return "\n".join([*parts, _LINES, "\n" + _CONTRACT])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -245,7 +219,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return generated_page.main(format_page(), __doc__.splitlines()[0], argv)
 
 
-def _fields(fields: Sequence[Field], *, stages: bool = False) -> str:
+def _fields(fields: Sequence[schema.Field], *, stages: bool = False) -> str:
     """Return the table of some fields, on request with the stage from which they have values."""
     heads: tuple[str, ...] = ("field", "shape", "type", "unit", "frame", "meaning")
     rows = []

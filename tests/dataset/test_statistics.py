@@ -91,7 +91,11 @@ def test_outcomes_are_counted_by_object(out: Path) -> None:
         last = len(file["trials/outcome"]) - 1
         before = Outcome(int(file["trials/outcome"][last]))
     change(out, TRIALS, "trials/outcome", last, lambda _: Outcome.CRASHED)
-    outcomes = count_funnel(out).outcomes
+    # A palm pose is counted once, at its first stand-off.
+    change(out, TRIALS, "trials/standoff_index", 0, lambda _: 1)
+    funnel = count_funnel(out)
+    outcomes = funnel.outcomes
+    assert funnel.candidates.tolist() == [3, 4, 4]
     assert outcomes.sum(axis=1).tolist() == [12, 12, 12]
     assert outcomes[:, Outcome.CRASHED].tolist() == [0, 0, 1]
     assert outcomes[2, before] == outcomes[1, before] - 1
