@@ -32,6 +32,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.exchange.export import export_dataset
 from drakegrasp.frames import GRASP_FRAMES
 from drakegrasp.hand.settings import load_config
+from drakegrasp.pictures import figures
 from drakegrasp.shapes.catalog import BuiltinObject
 
 
@@ -238,12 +239,6 @@ def quick_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BuiltinObject, "build", build)
 
 
-def test_classes_are_listed_with_their_parameters() -> None:
-    listed = run("objects", "list").stdout.splitlines()
-    assert len(listed) == 64
-    assert " ".join(listed[5].split()) == "6 can radius 32 to 38 mm, height 75 to 120 mm"
-
-
 @pytest.mark.usefixtures("quick_shapes")
 def test_as_many_objects_are_exported_as_asked_for(tmp_path: Path) -> None:
     for arguments, count, seed in (([], 2, 0), (["--per-class", 3, "--objects-seed", 7], 3, 7)):
@@ -364,18 +359,29 @@ def test_stats_of_files_of_another_state_are_one_line(out: Path) -> None:
     assert "files must be those of manifest.json, got others" in result.stderr
 
 
-def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:
+def test_findings_of_an_audit_are_written_as_json(tmp_path: Path) -> None:
     meshes, found = tmp_path / "m", tmp_path / "a.json"
     meshes.mkdir()
     trimesh.creation.box([0.05, 0.06, 0.07]).export(meshes / "1_box_a.obj")
-    _text(meshes)
-    result = run("audit", meshes, "--json", found)
-    assert result.exit_code == 0
-    fit, refused, total = result.stdout.splitlines()
-    assert fit.split() == ["fit", "1_box_a"] and refused.startswith("refused   1_text_a: ")
-    assert total == "2 meshes: 1 fit, 0 repaired, 1 refused; 0 with a warning (!)"
-    rows = {row["name"]: row for row in json.loads(found.read_text())}
-    assert rows["1_box_a"]["status"] == "fit" and rows["1_box_a"]["faces"] == 12
+    assert run("audit", meshes, "--json", found).exit_code == 0
+    (row,) = json.loads(found.read_text())
+    assert (row["name"], row["status"], row["faces"]) == ("1_box_a", "fit", 12)
+
+
+def test_figures_are_written_beside_the_dataset(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise DataError("not in this test")
+
+    monkeypatch.setattr(figures, "_sheet", refuse)
+    for name in ("png_bytes", "svg_bytes"):
+        monkeypatch.setattr(figures, name, lambda figure, *, dpi: b"")
+    result = run("figures", out, "--quiet")
+    assert result.exit_code == 0, result.output
+    lines = ["sheet is left out: not in this test", f"2 figures in {out / 'figures'}"]
+    assert result.stdout.splitlines() == lines
+    assert (out / "figures" / "distributions.svg").is_file()
+    folder = out.parent / "other"
+    assert run("figures", out, "--out", folder, "--quiet").stdout.endswith(f"in {folder}\n")
 
 
 # Verify

@@ -17,6 +17,7 @@ import pytest
 from helpers.objects import CUBE, from_above, standing
 
 from drakegrasp.config import Config
+from drakegrasp.frames import X_WT, invert_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -49,6 +50,16 @@ def commands_of(path: Path) -> list[bytes]:
     assert len(text) < LARGEST
     assert not re.search(r"<(script|link)[^>]+(src|href)=", text), "the page loads something"
     return [base64.b64decode(b) for b in re.findall(r"octet-binary;base64,([\w+/=]+)", text)]
+
+
+def places_of(path: Path) -> dict[str, np.ndarray]:
+    """Return the poses (4, 4) that the page gives to Drake's bodies, by their paths."""
+    said = map(msgpack.unpackb, commands_of(path))
+    return {
+        command["path"].partition("visualizer/")[2]: np.reshape(command["matrix"], (4, 4)).T
+        for command in said
+        if command["type"] == "set_transform"
+    }
 
 
 def keys_of(path: Path) -> bytes:
@@ -94,9 +105,12 @@ def test_attempt_that_is_not_simulated_is_shown_all_the_same(
     missed = replace(attempt, ray_hits=False)
     assert record_attempt(cube, standing(cube), missed, config, path).outcome is Outcome.RAY_MISS
     everything = b"".join(commands_of(path))
-    assert OBJECT in everything
-    assert HAND in everything
-    assert b"predicted" not in everything
+    assert OBJECT in everything and HAND in everything and b"predicted" not in everything
+    # At its start.
+    X_WO, X_GB = X_WT @ standing(cube), invert_pose(load_hand(config.hand).X_BG)
+    X_WB = places_of(path)["barrett_hand/base"]
+    np.testing.assert_allclose(X_WB, X_WO @ missed.X_OG @ X_GB, atol=1e-9)
+    np.testing.assert_allclose(places_of(path)["object/object"], X_WO, atol=1e-9)
 
 
 def test_object_at_rest_is_shown_without_a_hand(
@@ -114,15 +128,11 @@ def test_arrow_of_a_contact_begins_at_the_contact(
     missed, path = replace(attempt, ray_hits=False), tmp_path / "v.html"
     contacts = {"p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O}
     record_attempt(cube, standing(cube), missed, config, path, **contacts)
-    said = map(msgpack.unpackb, commands_of(path))
-    places = {
-        command["path"].partition("predicted/")[2]: np.reshape(command["matrix"], (4, 4)).T
-        for command in said
-        if command["type"] == "set_transform"
-    }
-    np.testing.assert_allclose(places["1"][:3, [2, 3]].T, [NHAT_Q_O[0], P_OQ[0]], atol=1e-12)
-    assert places["1/shaft"][2, 3] == pytest.approx((recording.ARROW - recording.HEAD) / 2.0)
-    assert places["1/head"][2, 3] == pytest.approx(recording.ARROW)
+    places, first = places_of(path), "object/object/predicted/1"
+    np.testing.assert_allclose(places[first][:3, [2, 3]].T, [NHAT_Q_O[0], P_OQ[0]], atol=1e-12)
+    shaft = (recording.ARROW - recording.HEAD) / 2.0
+    assert places[f"{first}/shaft"][2, 3] == pytest.approx(shaft)
+    assert places[f"{first}/head"][2, 3] == pytest.approx(recording.ARROW)
 
 
 def test_only_this_machine_is_served_and_only_meanwhile(
