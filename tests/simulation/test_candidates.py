@@ -209,7 +209,7 @@ def test_seed_and_name_decide_the_draw(
 
 @pytest.mark.parametrize(
     ("method", "most"),
-    [(("rotations",), 150), (("normals", "normals", "rotations"), 1500)],
+    [(("rotations",), 150), (("normals", "normals", "rotations"), 1500), (("closing",), 90)],
 )
 def test_smaller_number_of_turns_is_a_prefix(
     box: ObjectModel, method: tuple[str, ...], most: int
@@ -219,7 +219,7 @@ def test_smaller_number_of_turns_is_a_prefix(
     poses = np.stack([BOX_X_TO, upside_down])
     many, few = (Drawing(box, poses, coarse(method=method)).candidates(n) for n in (most, 40))
     assert (len(many), len(few)) == (most, 40)
-    for name in ("X_OG", "distance", "resting", "source"):
+    for name in ("X_OG", "distance", "resting", "source", "spread"):
         np.testing.assert_array_equal(getattr(many, name)[:40], getattr(few, name))
 
 

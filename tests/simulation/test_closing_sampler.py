@@ -63,16 +63,6 @@ def assert_equal(one: Candidates, two: Candidates) -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
-def test_first_palms_are_the_same_for_every_number(model: Callable[[str], ObjectModel]) -> None:
-    many = draw(model("tall"), 90)
-    assert len(many) == 90
-    for most in (1, 8, 60):
-        few = draw(model("tall"), most)
-        assert len(few) == most
-        np.testing.assert_array_equal(few.X_OG, many.X_OG[:most])
-        np.testing.assert_array_equal(few.spread, many.spread[:most])
-
-
 def test_rounding_of_the_resting_pose_changes_no_bit(model: Callable[[str], ObjectModel]) -> None:
     """The pose is simulated; nor do its place and its turn about the vertical matter."""
     first = draw(model("tall"), 60)

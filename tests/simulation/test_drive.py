@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.attempt import usual_materials
@@ -41,7 +41,7 @@ from drakegrasp.simulation.scene import (
     start_limits,
     transfer_state,
 )
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import run_attempt
 
 #: Rounding and the compliance of Drake's joint limits [rad].
 STILL = np.deg2rad(0.02)
@@ -52,59 +52,17 @@ def test_configuration_overrides_the_drive_of_the_hand(config: Config, hand: Han
     assert drive_of(hand, override_config(config, ["lift.drive=torque"]).lift) == "torque"
 
 
-def test_worm_needs_a_holding_torque(config: Config, tmp_path: Path) -> None:
+@pytest.mark.sim
+def test_worm_needs_a_holding_torque(cube: ObjectModel, config: Config, tmp_path: Path) -> None:
+    """It is the caller's mistake, not an outcome."""
     pincer = load_hand(write_pincer(tmp_path))
     assert drive_of(pincer, config.lift) == "torque"
+    worm, scene = (
+        override_config(config, ["lift.drive=worm"]),
+        build_scene(cube, config.physics, pincer),
+    )
     with pytest.raises(ConfigError, match=r"lift\.drive: must be torque or locked .* got 'worm'"):
-        drive_of(pincer, override_config(config, ["lift.drive=worm"]).lift)
-
-
-@pytest.mark.sim
-def test_attempt_with_an_impossible_drive_is_refused(
-    cube: ObjectModel, config: Config, hand: Hand
-) -> None:
-    """It is the caller's mistake, not an outcome."""
-    weak = tuple(replace(finger, holding_torque=None) for finger in hand.fingers)
-    scene = build_scene(cube, config.physics, replace(hand, fingers=weak))
-    with pytest.raises(ConfigError, match="holding_torque"):
-        run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
-
-
-@pytest.fixture(scope="module")
-def carton(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("carton"), [0.06, 0.06, 0.10])
-
-
-@pytest.fixture(scope="module")
-def pinch(carton: ObjectModel, config: Config, hand: Hand) -> dict[str, TrialRecord]:
-    """The carton, pinched symmetrically from above, by drive."""
-    scene = build_scene(carton, config.physics, hand)
-    return {
-        drive: run_attempt(
-            scene,
-            standing(carton),
-            from_above(carton, STANDOFF),
-            override_config(config, [f"lift.drive={drive}"]),
-        )
-        for drive in ("worm", "torque", "locked")
-    }
-
-
-@pytest.mark.sim
-@pytest.mark.parametrize("drive", ["worm", "locked"])
-def test_pinched_carton_stays_where_it_is(pinch: dict[str, TrialRecord], drive: str) -> None:
-    held = pinch[drive]
-    assert held.outcome is Outcome.SUCCESS
-    assert held.lift.slip < 1e-3
-    assert held.lift.turn < np.deg2rad(1.0)
-
-
-@pytest.mark.sim
-def test_fingers_without_a_worm_are_pushed_open(pinch: dict[str, TrialRecord]) -> None:
-    """Finger 3 is as strong as the two that it opposes: nothing centres the carton."""
-    pushed = pinch["torque"]
-    assert pushed.lift.slip > 15e-3
-    assert pushed.lift.turn > np.deg2rad(8.0)
+        run_attempt(scene, standing(cube), from_above(cube, STANDOFF), worm)
 
 
 @pytest.mark.sim
@@ -190,8 +148,16 @@ def test_worm_holds_what_is_within_its_strength(scene: Scene, cube: ObjectModel)
 
 
 @pytest.mark.sim
+@pytest.mark.parametrize(
+    ("broken", "error"),
+    [
+        (None, None),
+        ("lift._Monitor.update", TrialTimeout()),
+        ("drive.opening_torques", RuntimeError("no solution")),
+    ],
+)
 def test_lift_leaves_the_hand_as_it_was(
-    scene: Scene, cube: ObjectModel, config: Config, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, cube: ObjectModel, config: Config, monkeypatch, broken, error
 ) -> None:
     """Also where it is cut off: limits belong to the plant, which the next attempt uses."""
 
@@ -199,29 +165,17 @@ def test_lift_leaves_the_hand_as_it_was(
         lower = [float(joint.position_lower_limits()[0]) for joint in scene.closing_joints]
         return [*lower, *(motor.effort_limit() for motor in scene.motors)]
 
+    def fail(*_: object) -> None:
+        raise error
+
     before, materials = limits(), usual_materials(cube, config.physics)
+    if broken is not None:
+        monkeypatch.setattr(f"drakegrasp.simulation.{broken}", fail)
     _closed_on(scene, cube)
-    lifting.lift(scene, start_limits(config), config, materials)
-    assert limits() == before
-
-    def too_late(*_: object) -> None:
-        raise TrialTimeout
-
-    monkeypatch.setattr(lifting._Monitor, "update", too_late)
-    _closed_on(scene, cube)
-    with pytest.raises(TrialTimeout):
+    with pytest.raises(type(error)) if error else nullcontext():
         lifting.lift(scene, start_limits(config), config, materials)
     assert limits() == before
     assert scene.simulator.get_monitor() is None
-
-    def fail(_: Scene) -> None:
-        raise RuntimeError("no solution")
-
-    monkeypatch.setattr(drive_module, "opening_torques", fail)
-    _closed_on(scene, cube)
-    with pytest.raises(RuntimeError, match="no solution"):
-        lifting.lift(scene, start_limits(config), config, materials)
-    assert limits() == before
 
 
 @pytest.mark.sim

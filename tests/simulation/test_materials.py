@@ -65,13 +65,3 @@ def test_nothing_remains_of_the_materials_of_the_attempt_before(
     changed = run_attempt(scene, X_TO, other, config)
     assert changed.lift.slip != first.lift.slip
     assert_same_bits(run_attempt(scene, X_TO, plain, config), first)
-
-
-def test_friction_and_mass_decide_what_is_lost(
-    scene: Scene, cube: ObjectModel, config: Config
-) -> None:
-    X_TO = standing(cube)
-    slick = attempt_with(cube, config, friction_hand=0.05)
-    assert run_attempt(scene, X_TO, slick, config).outcome is not Outcome.SUCCESS
-    heavy = attempt_with(cube, config, mass=20.0)
-    assert run_attempt(scene, X_TO, heavy, config).outcome is not Outcome.SUCCESS

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -54,8 +53,8 @@ def as_dropped(mesh: trimesh.Trimesh) -> ObjectModel:
     )
 
 
-def tilt_deg(resting: Resting) -> float:
-    return float(np.degrees(np.arccos(np.clip(resting.X_TO[2, 2], -1.0, 1.0))))
+def tilt_deg(X: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(X[2, 2], -1.0, 1.0))))
 
 
 SHAPES = {
@@ -67,25 +66,19 @@ SHAPES = {
 
 @pytest.mark.parametrize("name", list(SHAPES))
 def test_shape_with_a_base_of_few_triangles_rests_as_it_was_dropped(name: str, config: Config):
-    resting = settle(as_dropped(SHAPES[name]), config)
-    assert tilt_deg(resting) < 0.5
+    """It keeps standing on the surface and with the step of a trial, also if it falls 2 cm."""
+    model = as_dropped(SHAPES[name])
+    resting = settle(model, config)
+    assert tilt_deg(resting.X_TO) < 0.5
     assert abs(resting.sink) < 1e-5
     assert np.all(resting.X_TO[:2, 3] == 0.0)
     assert resting.seconds < 2.0 and not resting.stopped and resting.notes == ()
 
-
-@pytest.mark.parametrize("name", list(SHAPES))
-def test_trial_keeps_standing_what_rests(name: str, config: Config):
-    """On the surface and with the step of a trial, also what falls 2 cm."""
-    model = as_dropped(SHAPES[name])
-    X_TO = settle(model, config).X_TO.copy()
-    X_TO[2, 3] += 0.02
     scene = build_object_scene(model, config.physics)
-    reset_object(scene, X_WT @ X_TO)
+    reset_object(scene, X_WT @ make_pose(np.eye(3), [0.0, 0.0, 0.02]) @ resting.X_TO)
     for _ in range(3):
         advance(scene, 0.4)
-        R_WO = scene.pose(scene.object)[:3, :3]
-        assert np.degrees(np.arccos(np.clip(R_WO[2, 2], -1.0, 1.0))) < 0.5
+        assert tilt_deg(scene.pose(scene.object)) < 0.5
         assert settle_module._sink(scene) < 3e-4
 
 
@@ -129,7 +122,7 @@ def test_convex_solid_stays_on_a_face_that_carries_it(base, top):
     edges = ConvexHull(flat).equations
     assume((edges[:, :2] @ mesh.center_mass[:2] + edges[:, 2]).max() < -0.005)
     set_down = load_config(overrides=["settle.drop_height=0"])
-    assert tilt_deg(settle(as_dropped(mesh), set_down)) < 0.5
+    assert tilt_deg(settle(as_dropped(mesh), set_down).X_TO) < 0.5
 
 
 @pytest.mark.parametrize(("side", "fall"), [(0.1, 0.25), (0.8, 0.0)])
@@ -216,7 +209,9 @@ def test_what_turns_or_moves_does_not_rest(
     if rests:
         assert settle(box, override_config(config, short)).seconds == pytest.approx(0.2)
     else:
-        with pytest.raises(MeshError, match="must come to rest on the table within"):
+        with pytest.raises(
+            MeshError, match=r"must come to rest on the table within 0\.5 s .* got .* m/s"
+        ):
             settle(box, override_config(config, short))
 
 
@@ -250,13 +245,6 @@ def test_what_rolls_is_stopped_and_noted(config: Config, monkeypatch: pytest.Mon
     resting = settle(as_dropped(trimesh.creation.box([0.05] * 3)), quick)
     assert resting.stopped and resting.seconds > 1.3
     assert resting.notes == ("it still rolled on the table and was stopped",)
-
-
-def test_what_never_rests_is_refused_with_its_speed(config: Config):
-    ball = as_dropped(trimesh.creation.icosphere(subdivisions=3, radius=0.03))
-    strict = override_config(config, ["settle.max_time=0.1"])
-    with pytest.raises(MeshError, match=r"must come to rest .* within 0\.1 s .* got .* m/s"):
-        settle(ball, strict)
 
 
 @pytest.mark.nightly
@@ -300,18 +288,8 @@ def test_rest_begins_again_when_the_object_moves_again(
     speeds: str, checks: int, config: Config, monkeypatch: pytest.MonkeyPatch
 ):
     """The speeds at the checks are scripted: slow or fast."""
+    script = iter([0.0 if each == "s" else 1.0 for each in speeds])
+    monkeypatch.setattr(settle_module, "_speeds", lambda _: (0.0, next(script)))
     rules = override_config(config, ["settle.rest_time=0.19", "settle.max_time=10"])
-    scene = SimpleNamespace(model=SimpleNamespace(name="1_thing_a"), time=0.0)
-    script, seen = iter(speeds), []
-
-    def look(_: Any) -> tuple[float, float]:
-        seen.append(scene.time)
-        return (0.0, 0.0) if next(script) == "s" else (0.0, 1.0)
-
-    def move(_: Any, seconds: float) -> None:
-        scene.time += seconds
-
-    monkeypatch.setattr(settle_module, "advance", move)
-    monkeypatch.setattr(settle_module, "_speeds", look)
-    assert settle_module._wait_for_rest(scene, rules) is False
-    np.testing.assert_allclose(seen, 0.05 * np.arange(1, checks + 1))
+    resting = settle(as_dropped(trimesh.creation.box([0.05] * 3)), rules)
+    assert resting.seconds == pytest.approx(0.05 * checks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -207,12 +208,7 @@ def test_same_attempt_gives_the_same_bits_whatever_ran_before(scene, cube, confi
     fresh = run_attempt(
         build_scene(cube, config.physics, hand), standing(cube), from_above(cube, STANDOFF), config
     )
-    for record in (again, fresh):
-        assert record.outcome is held.outcome
-        assert np.array_equal(record.lift.q, held.lift.q)
-        assert np.array_equal(record.closed.contacts.f_Q_O, held.closed.contacts.f_Q_O)
-        assert np.array_equal(record.lift.contacts.p_OQ, held.lift.contacts.p_OQ)
-        assert np.array_equal(record.lift.X_TO, held.lift.X_TO)
+    assert pickle.dumps(again) == pickle.dumps(fresh) == pickle.dumps(held)
 
 
 def test_lift_keeps_its_speed_and_acceleration_limits(scene, cube, config):
