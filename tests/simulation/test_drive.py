@@ -57,10 +57,8 @@ def test_worm_needs_a_holding_torque(cube: ObjectModel, config: Config, tmp_path
     """It is the caller's mistake, not an outcome."""
     pincer = load_hand(write_pincer(tmp_path))
     assert drive_of(pincer, config.lift) == "torque"
-    worm, scene = (
-        override_config(config, ["lift.drive=worm"]),
-        build_scene(cube, config.physics, pincer),
-    )
+    worm = override_config(config, ["lift.drive=worm"])
+    scene = build_scene(cube, config.physics, pincer)
     with pytest.raises(ConfigError, match=r"lift\.drive: must be torque or locked .* got 'worm'"):
         run_attempt(scene, standing(cube), from_above(cube, STANDOFF), worm)
 

@@ -13,7 +13,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt, Materials, usual_conditions
-from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.construction import FRICTION, build_scene
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
@@ -26,6 +26,16 @@ def attempt_with(cube: ObjectModel, config: Config, **materials: float) -> Attem
         from_above(cube, STANDOFF),
         conditions=replace(usual, materials=replace(usual.materials, **materials)),
     )
+
+
+def frictions(scene: Scene) -> list[float]:
+    """Return the own coefficient of friction of each shape of a scene."""
+    inspector = scene.plant.EvalSceneGraphInspector(scene.context)
+    return [
+        inspector.GetProximityProperties(geometry).GetProperty(*FRICTION).dynamic_friction()
+        for body in (scene.object, scene.table, *scene.links)
+        for geometry in scene.plant.GetCollisionGeometriesForBody(body)
+    ]
 
 
 def assert_same_bits(one: TrialRecord, other: TrialRecord) -> None:
@@ -47,13 +57,16 @@ def test_materials_of_an_attempt_are_those_of_a_scene_built_with_them(
     factor = materials.mass / cube.mass
     heavy = replace(cube, mass=materials.mass, I_OOcm_O=factor * cube.I_OOcm_O)
     plain = from_above(cube, STANDOFF)
-    built = run_attempt(build_scene(heavy, physics, hand), standing(cube), plain, config)
+    alone = build_scene(heavy, physics, hand)
+    coefficients = frictions(alone)
+    built = run_attempt(alone, standing(cube), plain, config)
     assert built.outcome is Outcome.SUCCESS
 
     found = run_attempt(
         scene, standing(cube), attempt_with(cube, config, **vars(materials)), config
     )
     assert_same_bits(found, built)
+    assert frictions(scene) == coefficients
 
 
 def test_nothing_remains_of_the_materials_of_the_attempt_before(
