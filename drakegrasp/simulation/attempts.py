@@ -187,7 +187,7 @@ class Attempts(GraspRows):
         """Return the preshapes in which a row is tried: the one that it names, or each preshape."""
         return hand.preshape_names if self.preshape[i] == EACH else (self.preshape[i],)
 
-    def stands(self, i: int, poses: Array) -> list[int]:
+    def resting_of(self, i: int, poses: Array) -> list[int]:
         """Return the indices of the object's resting poses (r, 4, 4) that a row is tried in.
 
         It is the resting pose that the row names, or all if it names none. It is empty if the
@@ -322,7 +322,7 @@ def make_attempts(
     # What each row has or may lack; `bad` gets a row's first fault.
     bad = [""] * count if invalid is None else list(invalid)
     palms = np.broadcast_to(np.asarray(q_grasp is None or alone, dtype=bool), (count,))
-    stands = _resting(resting, count, bad)
+    poses = _resting(resting, count, bad)
     under = _conditions(conditions, count, bad)
     names, kept = _preshapes(preshape, palms, hand, bad)
 
@@ -348,7 +348,7 @@ def make_attempts(
         preshape=names,
         conditions=under,
         row=np.arange(count, dtype=np.int64),
-        resting=stands,
+        resting=poses,
         X_TO=_poses(X_TO, count, "X_TO", bad, some=True),
         invalid=tuple(bad),
         of_row=of_row,
@@ -659,7 +659,7 @@ def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]
         if each != name or table.invalid[i]:
             continue
         given, stated = np.isfinite(table.X_TO[i]).all(), table.scale[i]
-        if not table.stands(i, poses):
+        if not table.resting_of(i, poses):
             found[i] = (
                 f"resting pose of {name} must be {must} (objects.resting_poses drops more), "
                 f"got {'another X_TO' if given else table.resting[i]}"
@@ -694,7 +694,7 @@ def given_candidates(
     tried = [
         (i, k, shape)
         for i in range(len(table))
-        for k in table.stands(i, X_TO)
+        for k in table.resting_of(i, X_TO)
         for shape in table.shapes(i, hand)
     ]
     tried = tried[: config.candidates.max]

@@ -19,6 +19,7 @@ from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.attempt import usual_materials
@@ -61,6 +62,24 @@ def test_worm_needs_a_holding_torque(cube: ObjectModel, config: Config, tmp_path
     scene = build_scene(cube, config.physics, pincer)
     with pytest.raises(ConfigError, match=r"lift\.drive: must be torque or locked .* got 'worm'"):
         run_attempt(scene, standing(cube), from_above(cube, STANDOFF), worm)
+
+
+@pytest.mark.sim
+def test_pinched_carton_stays_where_it_is_unless_fingers_are_pushed_open(
+    config: Config, hand: Hand, tmp_path: Path
+) -> None:
+    """Finger 3 is as strong as the two that it opposes: nothing centres the carton."""
+    carton = box_model(tmp_path, [0.06, 0.06, 0.10])
+    scene, attempt = build_scene(carton, config.physics, hand), from_above(carton, STANDOFF)
+    for drive in ("worm", "locked", "torque"):
+        rules = override_config(config, [f"lift.drive={drive}"])
+        record = run_attempt(scene, standing(carton), attempt, rules)
+        motion = record.lift.slip, record.lift.turn
+        if drive == "torque":
+            assert motion[0] > 15e-3 and motion[1] > np.deg2rad(8.0)
+        else:
+            assert record.outcome is Outcome.SUCCESS
+            assert motion[0] < 1e-3 and motion[1] < np.deg2rad(1.0)
 
 
 @pytest.mark.sim
