@@ -37,9 +37,9 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.placement import Placed, place_object
 from drakegrasp.verification.placing import (
     PlacedGrasp,
+    contacts_on_object,
+    contacts_on_rows,
     dataset_config,
-    place_on_object,
-    place_on_rows,
 )
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import ResultCallback, ignore_result, verify_batch
@@ -196,14 +196,14 @@ def verify_grasps(
         used = dataset_config(data, config, hand)
         # A given configuration is used as it is; that of a dataset has the rows' draws.
         drawn, frame = config is None, frame or "camera"
-        placed = place_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
+        placed = contacts_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
     else:
         _validate_target(on)
         if rows is not None:
             raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
         target = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
         used, frame = target.config, frame or "object"
-        placed = place_on_object(grasps, target, frame=frame, X_TC=X_TC)
+        placed = contacts_on_object(grasps, target, frame=frame, X_TC=X_TC)
     return run_verification(placed, used, client=client, show=show, explained=False)
 
 

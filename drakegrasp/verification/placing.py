@@ -111,43 +111,98 @@ class PlacedGrasp:
         return transform_points(self.X_OA, self.p_AQ), rotate_vectors(self.X_OA, self.nhat_Q_A)
 
 
-def place_on_object(
+def contacts_on_object(
     grasps: npt.ArrayLike | GraspRows,
     placed: PlacedObject,
     *,
     frame: str = "object",
     X_TC: npt.ArrayLike | None = None,
+) -> list[PlacedGrasp]:
+    """Return contacts on one object, in their order.
+
+    Args:
+        grasps: An array, see `read_grasps`, or a table of contacts.
+        placed: The object.
+        frame: Frame of the contacts.
+        X_TC: With frame "camera": pose of the camera in {T}, (4, 4), or one per grasp (n, 4, 4).
+
+    Raises:
+        GraspError: As `drakegrasp.verify_grasps`.
+    """
+    table, config = _read(grasps, frame, placed.config), with_whole_lifts(placed.config)
+    poses, found = _camera_poses(X_TC, frame, len(table)), list[PlacedGrasp]()
+    for i, pose in enumerate(poses):
+        # A caller who gives the pose of a camera may mean its inverse.
+        inverse = {} if pose is None else {"the inverse of X_TC": invert_pose(pose)}
+        found.append(_placed_contacts(table, i, placed, config, frame, pose, inverse))
+    return found
+
+
+def contacts_on_rows(
+    grasps: npt.ArrayLike | GraspRows,
+    dataset: GraspDataset,
+    rows: RowChoice = None,
+    *,
+    config: Config,
+    drawn: bool = True,
+    frame: str = "camera",
     overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
-    """Return grasps on one object, in their order.
+    """Return contacts on the objects of a dataset's rows.
+
+    Grasps of the same object are adjacent, so that its scene is built once.
+
+    Args:
+        grasps: See `contacts_on_object`.
+        dataset: The split.
+        rows: Row of each grasp, or one row for all; None for those of the table, else all rows.
+        config: Configuration of `dataset_config`.
+        drawn: Whether each grasp has the friction and mass that were drawn for its row.
+        frame: Frame of the contacts.
+        overrides: Settings of the caller; they take precedence over drawn values.
+
+    Raises:
+        GraspError: As `drakegrasp.verify_grasps`.
+    """
+    # Read all grasps before any object, so that a wrong number is reported at once.
+    table = _read(grasps, frame, config)
+    chosen = choose_rows(dataset, table.of_row if rows is None else rows, len(table))
+    cameras, found = _cameras_of_rows(dataset, chosen), list[PlacedGrasp]()
+    for i, placed, used in _objects_of_rows(dataset, chosen, config, drawn, overrides):
+        seen = {name: X_TC[i] for name, X_TC in cameras.items()}
+        found.append(_placed_contacts(table, i, placed, used, frame, seen[CAMERA], seen))
+    return found
+
+
+def place_on_object(
+    grasps: npt.ArrayLike | GraspRows,
+    placed: PlacedObject,
+    *,
+    frame: str = "object",
+    overrides: Sequence[str] = (),
+) -> list[PlacedGrasp]:
+    """Return contacts or postures on one object, in their order.
 
     Postures are tried on this object, whatever object name they give. Postures that name no resting
     pose are tried in all resting poses of a build.
 
     Args:
-        grasps: Contacts as an array, see `read_grasps`, or a table of contacts or of postures.
+        grasps: A table of postures, or see `contacts_on_object`.
         placed: The object.
         frame: Frame of contacts; postures have their own.
-        X_TC: With frame "camera": pose of the camera in {T}, (4, 4), or one per grasp (n, 4, 4).
         overrides: Settings of the caller; they take precedence over the conditions of a posture.
 
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
     """
-    table, config = _read(grasps, frame, placed.config), placed.config
-    if isinstance(table, Attempts):
-        stands = [placed]
-        if config.objects.resting_poses > 1:
-            others = find_resting_poses(placed.model, config)[1:]
-            stands += [replace(placed, X_TO=resting.X_TO) for resting in others]
-        table = replace(table, objects=(placed.model.name,) * len(table))
-        return _on_stands(table, range(len(table)), stands, config, overridden_keys(overrides))
-    config, found = with_whole_lifts(config), list[PlacedGrasp]()
-    for i, X in enumerate(_camera_poses(X_TC, frame, len(table))):
-        # A caller who gives the pose of a camera may mean its inverse.
-        inverse = {} if X is None else {"the inverse of X_TC": invert_pose(X)}
-        found.append(_placed_contacts(table, i, placed, config, frame, X, inverse))
-    return found
+    if not isinstance(grasps, Attempts):
+        return contacts_on_object(grasps, placed, frame=frame)
+    stands, config = [placed], placed.config
+    if config.objects.resting_poses > 1:
+        others = find_resting_poses(placed.model, config)[1:]
+        stands += [replace(placed, X_TO=resting.X_TO) for resting in others]
+    table = replace(grasps, objects=(placed.model.name,) * len(grasps))
+    return _on_stands(table, range(len(table)), stands, config, overridden_keys(overrides))
 
 
 def place_on_rows(
@@ -160,35 +215,21 @@ def place_on_rows(
     frame: str = "camera",
     overrides: Sequence[str] = (),
 ) -> list[PlacedGrasp]:
-    """Return grasps on the objects of a dataset's rows.
+    """Return contacts or postures on the objects of a dataset's rows; see `contacts_on_rows`.
 
-    Grasps of the same object are adjacent, so that its scene is built once. Postures are tried on
-    the object and in the resting pose of their rows, whatever they state themselves.
-
-    Args:
-        grasps: See `place_on_object`.
-        dataset: The split.
-        rows: Row of each grasp, or one row for all; None for those of the table, else all rows.
-        config: Configuration of `dataset_config`.
-        drawn: Whether each grasp has the friction and mass that were drawn for its row.
-        frame: Frame of contacts.
-        overrides: Settings of the caller; they take precedence over drawn values.
+    Postures are tried on the object and in the resting pose of their rows, whatever they state
+    themselves.
 
     Raises:
-        GraspError: As `drakegrasp.verify_grasps`, or if postures are in the frames of mesh files.
+        GraspError: As `contacts_on_rows`, or if postures are in the frames of mesh files.
     """
-    # Read all grasps before any object, so that a wrong number is reported at once.
-    table = _read(grasps, frame, config)
-    chosen = choose_rows(dataset, table.of_row if rows is None else rows, len(table))
+    if not isinstance(grasps, Attempts):
+        how: dict[str, Any] = {"drawn": drawn, "frame": frame, "overrides": overrides}
+        return contacts_on_rows(grasps, dataset, rows, config=config, **how)
+    _validate_no_mesh_frame(grasps)
+    chosen = choose_rows(dataset, grasps.of_row if rows is None else rows, len(grasps))
     on_rows = _objects_of_rows(dataset, chosen, config, drawn, overrides)
-    if isinstance(table, Attempts):
-        _validate_no_mesh_frame(table)
-        return [_posture_of_row(table, i, placed, used) for i, placed, used in on_rows]
-    cameras, found = _cameras_of_rows(dataset, chosen), list[PlacedGrasp]()
-    for i, placed, used in on_rows:
-        seen = {name: X_TC[i] for name, X_TC in cameras.items()}
-        found.append(_placed_contacts(table, i, placed, used, frame, seen[CAMERA], seen))
-    return found
+    return [_posture_of_row(grasps, i, placed, used) for i, placed, used in on_rows]
 
 
 def place_on_dataset(
@@ -226,11 +267,11 @@ def place_on_dataset(
     return found
 
 
-def _read(grasps: npt.ArrayLike | GraspRows, frame: str, config: Config) -> ContactRows | Attempts:
+def _read(grasps: npt.ArrayLike | GraspRows, frame: str, config: Config) -> ContactRows:
     """Return a given table, or read contacts of the configuration's hand."""
     validate_frame(frame)
     if isinstance(grasps, GraspRows):
-        assert isinstance(grasps, ContactRows | Attempts)
+        assert isinstance(grasps, ContactRows)
         return grasps
     return read_grasps(grasps, load_hand(config.hand_source).num_fingers)
 

@@ -20,7 +20,7 @@ from drakegrasp.frames import (
 )
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.verification.placing import place_on_object
+from drakegrasp.verification.placing import contacts_on_object
 from drakegrasp.verification.prediction import read_grasps
 
 
@@ -170,7 +170,7 @@ def test_the_frames_agree(single, cameras):
     for frame, values in grasps.items():
         where = {"X_TC": X} if frame == "camera" else {}
         for grasp, due in zip(
-            place_on_object(values, placed, frame=frame, **where), grasps_O, strict=True
+            contacts_on_object(values, placed, frame=frame, **where), grasps_O, strict=True
         ):
             found = pack_grasp(*grasp.in_object_frame())
             np.testing.assert_allclose(found, due, atol=1e-12)
@@ -201,5 +201,5 @@ def test_the_frames_agree(single, cameras):
 )
 def test_a_frame_out_of_place_is_refused(frame, X, message):
     placed = placed_at(np.eye(4), np.eye(4))
-    text = refused(place_on_object, np.ones((2, 18)), placed, frame=frame, X_TC=X)
+    text = refused(contacts_on_object, np.ones((2, 18)), placed, frame=frame, X_TC=X)
     assert text.startswith(message)
