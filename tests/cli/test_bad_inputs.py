@@ -50,7 +50,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "export original": ("export", "{out}", "{to}/original", "--to", "original", "--quiet"),
     "export hf": ("export", "{out}", "{to}/hf", "--to", "hf", "--quiet"),
     "export dexgraspbench": ("export", "{out}", "{to}/dex", "--to", "dexgraspbench", "--quiet"),
-    "export isaac_grasp": ("export", "{out}", "{to}/glb", "--to", "glb", "--quiet"),
+    "export isaac_grasp": ("export", "{out}", "{to}/isaac_grasp", "--to", "isaac_grasp", "--quiet"),
     "verify": (
         "verify",
         f"{{out}}/{OTO}",

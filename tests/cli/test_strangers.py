@@ -76,7 +76,8 @@ def test_folder_that_is_a_link_is_neither_written_nor_swept(
 
 
 @pytest.mark.parametrize(
-    ("folder", "command"), [("figures", ["figures"]), ("export_glb", ["export", "--to", "glb"])]
+    ("folder", "command"),
+    [("figures", ["figures"]), ("export_meshes", ["export", "--to", "meshes"])],
 )
 def test_folder_of_pictures_that_is_a_link_is_not_written_to(
     out: Path, tmp_path: Path, folder: str, command: list[str]
