@@ -174,12 +174,6 @@ class Field:
         return np.full((count, *self.row_shape(sizes)), fill, dtype=self.dtype)
 
 
-def is_readable(version: object) -> bool:
-    """Return whether an attribute or key `schema_version` names a schema that can be read."""
-    whole = isinstance(version, int | np.integer) and not isinstance(version, bool)
-    return whole and version == SCHEMA_VERSION
-
-
 def validate_schema_version(path: Path, version: object) -> None:
     """Raise an error if a file has another version of the schema.
 
@@ -190,7 +184,8 @@ def validate_schema_version(path: Path, version: object) -> None:
     Raises:
         DataError: If the version differs.
     """
-    if not is_readable(version):
+    whole = isinstance(version, int | np.integer) and not isinstance(version, bool)
+    if not (whole and version == SCHEMA_VERSION):
         got = "none" if version is None else printable(str(version)[:40])
         raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {got}; {OTHER_SCHEMA}")
 
