@@ -119,11 +119,6 @@ def pad_surfaces(model: ModelFile, fingers: Sequence[Finger]) -> tuple[Array, ..
     return tuple(surfaces)
 
 
-def hull_planes(corners: Array) -> Array:
-    """Return the planes (m, 4) of the convex hull of corners (n, 3) [m]: n.p + d <= 0 within."""
-    return np.asarray(ConvexHull(corners).equations)
-
-
 def ray_span(corners: Array, start: Array, direction: Array) -> tuple[float, float] | None:
     """Return where a line enters and leaves the convex hull of corners; None if it misses.
 
@@ -134,7 +129,7 @@ def ray_span(corners: Array, start: Array, direction: Array) -> tuple[float, flo
             before the start.
     """
     # On the line p = start + t direction, each plane n.p + d <= 0 of the hull limits t.
-    planes = hull_planes(corners)
+    planes = ConvexHull(corners).equations
     slope, offset = planes[:, :3] @ direction, planes[:, :3] @ start + planes[:, 3]
     if (offset[np.abs(slope) < PARALLEL] > 0.0).any():
         return None

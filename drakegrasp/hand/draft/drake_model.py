@@ -60,7 +60,6 @@ from drakegrasp.hand.parsing import (
     validate_joints,
 )
 from drakegrasp.hand.shapes import hull_corners
-from drakegrasp.mesh.surfaces import obj_text
 
 #: Maximum size of a model's text [bytes].
 LONGEST = 20_000_000
@@ -106,10 +105,8 @@ def parse_model(path: Path, find: Callable[[str, Path], Path]) -> VendorModel:
     def find_mesh(name: str) -> Shape:
         return read_mesh(find(uris[name], path.parent))
 
-    efforts = declared_efforts(root)
-
     # Bodies and joints; a joint to the world only fixes the hand.
-    links = {}
+    links, efforts = {}, declared_efforts(root)
     for body in map(plant.get_body, plant.GetBodyIndices(instance)):
         name, solid = body.name(), plant.GetCollisionGeometriesForBody(body)
         own = solid or plant.GetVisualGeometriesForBody(body)
@@ -153,12 +150,8 @@ def _text_of(path: Path) -> tuple[bytes, Element]:
         raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
 
 
-#: A tetrahedron.
-_STAND_IN = obj_text(
-    np.vstack((np.zeros(3), 0.01 * np.eye(3))),
-    [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
-    normals=False,
-)
+#: A tetrahedron, as a Wavefront file.
+_STAND_IN = "v 0 0 0\nv .01 0 0\nv 0 .01 0\nv 0 0 .01\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
 def _with_stand_ins(model: bytes, folder: Path) -> tuple[bytes, dict[str, str]]:
