@@ -127,7 +127,7 @@ FAULTS = {
     "another coupling in the model": (
         "allegro", ".sdf", "<xyz>0 1 0</xyz>\n        <limit><lower>-0.174",
         '<xyz>0 1 0</xyz><mimic joint="index_mcp_joint"><multiplier>-1</multiplier>'
-        "<offset>0.2</offset><reference>0</reference></mimic>\n        <limit><lower>-0.174",
+        "<offset>0.1</offset><reference>0.1</reference></mimic>\n        <limit><lower>-0.174",
         "couplings",
         r"joint 'index_pip_joint' must be coupled to 'index_mcp_joint' by -1 and 0\.2, as in"),
     "inertia of a body that is too long": (
