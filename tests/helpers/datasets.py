@@ -305,6 +305,16 @@ def _make(out: Path, meshes: Path, overrides: tuple[str, ...]) -> Path:
     return out
 
 
+def end_lift(out: Path, row: int, slip: float) -> None:
+    """Let the lift of a row of /trials be one that was ended, after the object slid so far."""
+    with h5py.File(out / TRIALS, "r+") as file:
+        trials = file["trials"]
+        turn = make_pose(rotation_about([0, 0, 1], np.deg2rad(1.0)), [0.0, 0.0, slip])
+        X_OG = unpack_pose(trials["X_OG"][row])
+        trials["X_OG_lifted"][row] = pack_pose(X_OG @ invert_pose(turn))
+        trials["slip"][row], trials["outcome"][row] = slip, Outcome.MOVED
+
+
 Edit = Callable[[np.ndarray], Any]
 
 
