@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
-from drakegrasp.generation.prepare import PrepareTask, prepare_one
+from drakegrasp.generation.prepare import DrawTask, PrepareTask, prepare_one
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes, source_sha256
 
@@ -54,3 +54,9 @@ def test_mesh_that_is_no_solid_is_refused_with_its_reason(task: PrepareTask) -> 
     assert entry.mesh_sha256 == source_sha256(task.source)
     assert entry.reason and not entry.reason.startswith(path.name)
     assert not Path(task.out).exists()
+
+
+def test_files_of_the_object_travel_to_who_draws_more_palms(task: PrepareTask) -> None:
+    prepare_one(task)
+    more = DrawTask(out=task.out, name="1_box", config=task.config, count=9)
+    assert set(more.reads()) >= {"objects/1_box.npz", "objects/1_box.plan.h5"}

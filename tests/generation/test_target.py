@@ -19,10 +19,10 @@ HITS: dict[str, Sequence[int]] = {
     "barren": range(0),
     "short": (1, 2, 7),
 }
-#: Others: two that are given up before their last hits, and one with three at each palm pose.
+#: Others: two that are given up before their last hits, one of them at a hit, and one with three at each palm pose.
 ODD: dict[str, Sequence[int]] = {
     "late": (3, 4, 70, 71, 72),
-    "later": (0, 100),
+    "later": (0, 61, 100),
     "triple": sorted(3 * [*range(2, PALMS, 5)]),
 }
 EVERY = {**HITS, **ODD}
