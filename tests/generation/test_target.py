@@ -19,7 +19,8 @@ HITS: dict[str, Sequence[int]] = {
     "barren": range(0),
     "short": (1, 2, 7),
 }
-#: Others: two that are given up before their last hits, one of them at a hit, and one with three at each palm pose.
+#: Others: two that are given up before their last hits, one of them at a hit, and one with three
+#: hits at a palm pose.
 ODD: dict[str, Sequence[int]] = {
     "late": (3, 4, 70, 71, 72),
     "later": (0, 61, 100),
