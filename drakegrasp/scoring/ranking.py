@@ -53,9 +53,9 @@ COLUMNS = ("clearance", "table", "touch", "gap", "push", "opposition", "arm", "r
 #: Shifts of the palm along Gx and Gy [m], and the factor of the friction, of the further lifts.
 SHIFTS, SLIPPERY = 0.004 * np.array([[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]]), 0.63
 #: Logistic weights of the chance of a sample: a constant, for the score by closing, and for the
-#: share of lifts. They were fitted to lifts of the Barrett Hand on household meshes, see "Stated
-#: chances" in docs/results/choice.md.
-WITHOUT_LIFTS, WITH_LIFTS = (-5.6, 8.9), (-5.5, 5.7, 4.1)
+#: share of lifts; and the largest chance, since no score knows the unseen side. They were fitted to
+#: lifts of the Barrett Hand on household meshes, see "Stated chances" in docs/results/choice.md.
+WITHOUT_LIFTS, WITH_LIFTS, CEILING = (-5.6, 10.5), (-5.5, 6.7, 4.8), 0.92
 #: A grasp is likely from this chance on.
 LIKELY = 0.5
 
@@ -385,4 +385,4 @@ def chances(score: Array, share: Array) -> Array:
     logit = constant + of_score * score
     constant, of_score, of_share = WITH_LIFTS
     logit = np.where(np.isnan(share), logit, constant + of_score * score + of_share * share)
-    return np.asarray(1.0 / (1.0 + np.exp(-logit)))
+    return np.asarray(CEILING / (1.0 + np.exp(-logit)))

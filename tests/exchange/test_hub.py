@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +27,27 @@ from drakegrasp.exchange.export import export_dataset
 
 pq = pytest.importorskip("pyarrow.parquet")
 pytest.importorskip("datasets")
+
+#: What `datasets` finds in a folder, in a process of its own: it loads half of the packages of the
+#: environment, whose warnings are not ours.
+LOADER = """
+import json, sys
+import datasets, numpy as np
+folder, cache = sys.argv[1:]
+found = {}
+for config in datasets.get_dataset_config_names(folder):
+    for split, rows in datasets.load_dataset(folder, config, cache_dir=cache).items():
+        streamed = datasets.load_dataset(folder, config, streaming=True)[split]
+        found[f"{config}/{split}"] = {
+            "trial_id": rows["trial_id"][:],
+            "streamed": [row["trial_id"] for row in streamed],
+            "pixels": [
+                [np.asarray(row[name]).tolist() for name in ("image", "depth", "mask")]
+                for row in rows
+            ],
+        }
+print(json.dumps(found))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +83,27 @@ def test_rows_are_those_of_the_data_file(
         depth = pixels_of(row["depth"]) * DEPTH_UNIT
         assert np.abs(depth - sample.image[3]).max() <= 0.51 * DEPTH_UNIT
         assert (pixels_of(row["mask"]) == 255 * sample.mask).all()
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_datasets_loads_what_the_files_hold(folder: Path, tmp_path: Path) -> None:
+    process = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", LOADER, str(folder), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PATH": "", "HOME": str(tmp_path), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)},
+    )
+    assert process.returncode == 0, process.stderr
+    found = json.loads(process.stdout.splitlines()[-1])
+    assert set(found) == {f"{camera}/{split}" for camera in ("oto", "otm") for split in SPLITS}
+    for name, read in found.items():
+        rows = table_of(folder, *name.split("/"))
+        assert read["trial_id"] == read["streamed"] == [row["trial_id"] for row in rows]
+        for pixels, row in zip(read["pixels"], rows, strict=True):
+            for values, image in zip(pixels, ("image", "depth", "mask"), strict=True):
+                np.testing.assert_array_equal(values, pixels_of(row[image]))
 
 
 def test_card_names_licence_files_and_samples(dataset: Path, folder: Path) -> None:
