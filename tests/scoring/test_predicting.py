@@ -52,7 +52,9 @@ def test_lifts_end_at_the_first_grasp_that_holds_in_all_of_them(cloud, view):
         and np.nanmax(np.delete(seen.share, seen.order[0]), initial=0.0) < 1.0
     )
     assert seen.completion == "view" and seen.likely
+    # No more than what was measured on household meshes is promised, however good a grasp looks.
     assert seen.explain().startswith("the first grasp is a sample with a chance of 9")
+    assert 0.9 < seen.chance.max() <= 0.92
     # The same bits again.
     again = dg.rank(proposed, cloud, simulate=8, view=tuple(view), config=CONFIG)
     np.testing.assert_array_equal(again.share, seen.share)
