@@ -7,9 +7,10 @@ not depend on the CPU).
 
 `Frame` names the frames in which a caller may give or ask for grasps.
 
-Letters: W world, T table-top centre, O object (centre of the mesh's bounding box), Ocm its centre
-of mass, G palm (+Gz out of the palm), Fi distal link of finger i, Qi contact point of finger i,
-C camera (+X right, +Y down, +Z forward), I image frame.
+Letters: W world, T table-top centre, O object (centre of the mesh's bounding box, axes of the file
+turned so that its `up` is +z), M mesh (origin and axes of the file), Ocm the object's centre of
+mass, G palm (+Gz out of the palm), Fi distal link of finger i, Qi contact point of finger i, C
+camera (+X right, +Y down, +Z forward), I image frame.
 
 Inside the package a pose is a (4, 4) float64 array. In files it is (12,): the first three rows,
 row-major. Drake's `RigidTransform` is used only where Drake is called.

@@ -160,7 +160,8 @@ def guards(page: Path) -> Iterator[str]:
         if table:
             yield from re.findall(r"`(\w+)`", line.split("|")[-2])
     text = " ".join(read(page).split())
-    yield from re.findall(r"guarded by `(\w+)`", text)
+    for names in re.findall(r"[Gg]uarded by ((?:`\w+`(?:, | and )?)+)", text):
+        yield from re.findall(r"`(\w+)`", names)
     yield from re.findall(r"`(\w+)` guards", text)
 
 

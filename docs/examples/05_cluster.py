@@ -5,8 +5,6 @@ Start two Dask workers, let them build a dataset, and let them verify grasps.
 Concepts: scheduler, worker, client, work unit.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 from distributed import Client, LocalCluster
 
@@ -19,19 +17,14 @@ def main() -> None:
     """Build the mesh of 03_own_mesh.py and verify grasps of 01_dataset.py on two workers."""
     # Any Dask cluster does, of dask-jobqueue for example. A worker must have one thread.
     with LocalCluster(n_workers=2, threads_per_worker=1) as cluster, Client(cluster) as client:
-        # A build connects by an address or by a scheduler file that every machine can read.
-        client.write_scheduler_file("example/scheduler.json")
         overrides = ["candidates.max=8", "unit_candidates=4"]
         config = dg.load_config("fast", overrides=overrides)
-        # This scheduler listens on this machine only; others need a certificate (tls_files).
-        reach = {"scheduler_file": "example/scheduler.json", "tls": False}
-        report = dg.build_dataset("example/meshes", "example/vase", config=config, **reach)
+        report = dg.build_dataset("example/meshes", "example/vase", config=config, client=client)
         print(report.simulated, "work units simulated on", cluster.scheduler_address)
 
-        # Verification takes the client itself. The dataset's own grasps stand for predictions.
+        # The dataset's own grasps stand for predictions.
         data = dg.GraspDataset(DATASET, split="test")
         verdicts = dg.verify_grasps(data.column("grasps"), on=data, client=client)
-    Path("example/scheduler.json").unlink()
 
     # The epsilon of Ferrari and Canny: the smallest wrench that the contacts cannot resist.
     figure, axes = plt.subplots(figsize=(5.0, 2.6))

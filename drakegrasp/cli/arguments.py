@@ -26,14 +26,17 @@ if TYPE_CHECKING:
 
 
 def read_path(kind: Any, tokens: tuple[Token, ...]) -> Path:
-    """Return the path that a word names.
+    """Return the path of this machine that a word names.
 
     Raises:
-        ValueError: If it is empty, e.g. an unset variable of a shell, or no file can have it.
+        ValueError: If it is empty, e.g. an unset variable of a shell, or an address, or no file can
+            have it.
     """
     text = tokens[0].value
     if not text.strip():
         raise ValueError(f"must be a path, got {text!r}")
+    if ADDRESS.match(text):
+        raise ValueError(f"must be a path of this machine, got the address {text!r}")
     try:
         os.lstat(text)
     except (FileNotFoundError, NotADirectoryError, PermissionError):
@@ -43,13 +46,6 @@ def read_path(kind: Any, tokens: tuple[Token, ...]) -> Path:
             f"must be a path, got one that no file has ({first_line(error)})"
         ) from None
     return Path(text)
-
-
-def read_place(kind: Any, tokens: tuple[Token, ...]) -> Path:
-    """Return a path of this machine; datasets alone are read at an address."""
-    if ADDRESS.match(text := tokens[0].value):
-        raise ValueError(f"must be a path of this machine, got the address {text!r}")
-    return read_path(kind, tokens)
 
 
 def read_whole(kind: Any, tokens: tuple[Token, ...]) -> int:
@@ -91,14 +87,14 @@ def tidy_dataset(kind: Any, path: Path) -> None:
 
 
 #: Paths: any, of a file or folder that exists, of a file that exists, of a file to write.
-AnyPath: TypeAlias = Annotated[Path, Parameter(converter=read_place, metavar="PATH")]
+AnyPath: TypeAlias = Annotated[Path, Parameter(converter=read_path, metavar="PATH")]
 Existing: TypeAlias = Annotated[AnyPath, Parameter(validator=validate_existing)]
 File: TypeAlias = Annotated[AnyPath, Parameter(validator=validate_existing_file, metavar="FILE")]
 NewFile: TypeAlias = Annotated[AnyPath, Parameter(validator=validate_no_folder, metavar="FILE")]
 Folder: TypeAlias = Annotated[AnyPath, Parameter(metavar="DIR")]
-#: The directory of a dataset or one of its files, and a data file or its address.
+#: The directory of a dataset, and a data file.
 Dataset: TypeAlias = Annotated[AnyPath, Parameter(validator=tidy_dataset)]
-DataFile: TypeAlias = Annotated[Path, Parameter(converter=read_path, metavar="FILE")]
+DataFile: TypeAlias = Annotated[AnyPath, Parameter(metavar="FILE")]
 #: Numbers of things.
 Count: TypeAlias = Annotated[int, Parameter(converter=read_whole, metavar="N")]
 Positive: TypeAlias = Annotated[Count, Parameter(validator=Number(gte=1))]
@@ -109,6 +105,8 @@ Settings: TypeAlias = Annotated[tuple[str, ...], Parameter(name="--set", metavar
 Units: TypeAlias = Literal["m", "cm", "mm"]
 Split: TypeAlias = Literal["train", "valid", "test"]
 GraspFrame: TypeAlias = Literal["object", "table", "camera", "world", "mesh"]
+#: Of postures on a dataset; a file cannot say which of its meshes it means.
+RowFrame: TypeAlias = Literal["object", "table", "camera", "world"]
 AsJson: TypeAlias = Annotated[bool, Parameter(name="--json")]
 
 
@@ -140,8 +138,8 @@ class What:
     Attributes:
         objects: A directory of .obj, .stl, .ply or .glb files, or the built-in objects.
         out: Directory of the dataset. The same command continues an interrupted build.
-        config: Configuration: a file, or the preset paper, fast, randomized or released. [default:
-            fast]
+        config: Configuration: a file, or the preset paper, released, fast, randomized or bench1.
+            [default: fast]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
         samples: Stop when all objects together have N samples; a larger N continues the build.
         samples_per_object: Stop an object when it has N samples. [default: 20, with fast and

@@ -49,8 +49,8 @@ def assemble(
     Args:
         out: Directory of the dataset.
         reject: Trials that must not become samples: the reject.json of an inspection.
-        overrides: Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may
-            be given several times. Your own filters must be given again:
+        overrides: Change a setting that changes nothing simulated, e.g. filters.outlier_sigma=3 or
+            split.seed=1; may be given several times. Your own filters must be given again:
             filters.own=FILE.py:NAME.
     """
     from drakegrasp.cli import tables
@@ -115,8 +115,8 @@ def merge(
     Args:
         into: Directory of the new dataset.
         outs: Directories of datasets.
-        overrides: Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may
-            be given several times. Your own filters must be given again:
+        overrides: Change a setting that changes nothing simulated, e.g. filters.outlier_sigma=3 or
+            split.seed=1; may be given several times. Your own filters must be given again:
             filters.own=FILE.py:NAME.
     """
     from drakegrasp.cli import tables
@@ -214,7 +214,7 @@ def inspect(
     port: Annotated[Count, Parameter(validator=Number(gte=0, lte=65535))] = PORT,
     no_browser: bool = False,
 ) -> None:
-    """Render at grasps in a browser, and reject them.
+    """Look at grasps in a browser, and reject them.
 
     The page shows every attempt in OUT with images, contacts, forces and a 3D view, the most
     anomalous first. Rejections are written to OUT/reject.json immediately; assemble --reject reads
@@ -277,7 +277,12 @@ def _formats() -> str:
     return "Formats:\n" + "\n".join(fill(row, 79, subsequent_indent=" " * 17) for row in rows)
 
 
-export = new_group("export", None, help_epilogue=_formats())
+export = new_group(
+    "export",
+    None,
+    usage="drakegrasp export --to FORMAT [OPTIONS] OUT [DIRECTORY]",
+    help_epilogue=_formats(),
+)
 
 
 @export.default

@@ -26,7 +26,7 @@ COMMANDS = {
     "scenes": ("datasets:scenes", "Render views of training scenes, independent of grasps."),
     "check": ("datasets:check", "Check every invariant of a dataset."),
     "stats": ("datasets:stats", "Count outcomes, how well grasps hold, and samples."),
-    "inspect": ("datasets:inspect", "Render at grasps in a browser, and reject them."),
+    "inspect": ("datasets:inspect", "Look at grasps in a browser, and reject them."),
     "figures": ("datasets:figures", "Draw a dataset: pictures as PNG and SVG, numbers as JSON."),
     "replay": ("datasets:replay", "Run a trial again and compare every value."),
     "predict": ("predict:predict", "Write grasps for what a camera saw, best first."),
@@ -34,6 +34,11 @@ COMMANDS = {
     "score": ("score:score", "Score predicted grasps against reference rows."),
     "bench-set": ("build:bench_set", "Build the frozen benchmark drakegrasp-bench-1 in OUT."),
     "export": ("datasets:export", "Write the samples of a dataset in another format."),
+}
+#: Usage of functions whose optional or repeated arguments cyclopts does not name.
+USAGES = {
+    "merge": "[OPTIONS] INTO OUTS...",
+    "score": "--dataset FILE [OPTIONS] [PREDICTIONS]...",
 }
 #: Commands that the same words continue after Ctrl-C.
 RESUMABLE = ("build", "submit", "bench-set")
@@ -52,7 +57,8 @@ app = new_group(
     version=_version,
 )
 for _number, (_name, (_place, _)) in enumerate(COMMANDS.items()):
-    app.command(f"drakegrasp.cli.{_place}", name=_name, sort_key=_number)
+    _own = {"usage": f"drakegrasp {_name} {USAGES[_name]}"} if _name in USAGES else {}
+    app.command(f"drakegrasp.cli.{_place}", name=_name, sort_key=_number, **_own)
 for _flag in ("--help", "--version"):
     app[_flag].group = (OPTIONS,)
 

@@ -154,7 +154,7 @@ def new_hand(
     if drafted.findings[0].ok:
         _draw(drafted.path, picture)
         say(
-            f"Render at {picture}: pads must face each other, and Gz (blue) must point out of the "
+            f"Look at {picture}: pads must face each other, and Gz (blue) must point out of the "
             "palm."
         )
     say(f"Then: drakegrasp hand check {drafted.path}")
@@ -171,7 +171,8 @@ def check_hand_file(hand_file: Name, /, *, picture: NewFile | None = None) -> No
 
     Args:
         hand_file: Name of a hand that comes with the package, or a hand file (YAML).
-        picture: Write a picture of the hand, open and closed, with pads and palm frame.
+        picture: Write a picture of the hand, open, half closed and closed, with pads and palm
+            frame.
     """
     from drakegrasp.hand_setup import check_hand
 

@@ -51,11 +51,12 @@ class Target:
         dataset: Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row
             specifies the object, its pose and the camera's pose.
         split: Rows of the dataset, and group in an HDF5 file of grasps. [default: test]
-        frame: Frame of the grasps; mesh, with --object, has the axes and the origin of the mesh
-            file. [default: object; with --dataset camera; for postures as the file specifies]
+        frame: Frame of the grasps; mesh has the axes and the origin of the mesh file, and for
+            postures needs --object. [default: object; with --dataset camera; for postures as the
+            file specifies]
         hand: The hand. [default: that of the configuration]
-        config: Configuration: a file, or the preset paper, fast, randomized or released. [default:
-            that of the dataset, else the defaults]
+        config: Configuration: a file, or the preset paper, released, fast, randomized or bench1.
+            [default: that of the dataset, else the defaults]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
     """
 

@@ -122,8 +122,8 @@ def assemble(
 
     Args:
         out: Directory of the dataset.
-        overrides: `key=value` strings that change the filters or the split of the dataset. If the
-            split changes, all objects are drawn anew.
+        overrides: `key=value` strings that change settings of the dataset on which no shard
+            depends, e.g. of the filters. If the split changes, all objects are drawn anew.
         rejected: Trials that an inspection rejects, as ids or identities; they do not become
             samples.
         progress: Called with the number of finished steps and the number of all steps.

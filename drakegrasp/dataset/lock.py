@@ -49,8 +49,8 @@ def build_lock(out: Path) -> Iterator[str | None]:
         held = FileLock(path).acquire(timeout=0)
     except Timeout:
         raise DataError(
-            f"{out}: must be built by one process at a time, got {_name_in(path)}; wait for it or "
-            "choose another --out"
+            f"{out}: must be built by one process at a time, got {_name_in(path)}; wait for "
+            "it, or use another directory"
         ) from None
     except OSError as error:
         raise unwritable(out, error) from None

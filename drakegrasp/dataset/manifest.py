@@ -450,7 +450,7 @@ def release_directory(out: Path) -> None:
 
 
 def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifest:
-    """Return a manifest with other values of the filters or the split.
+    """Return a manifest with other values of settings on which no shard depends.
 
     If the split changes, no object has one any more, so that all are drawn anew.
 
@@ -464,8 +464,8 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
     config = override_config(manifest.config, overrides)
     if config.simulation_hash() != manifest.config.simulation_hash():
         raise ConfigError(
-            "only values of filters and split can change, got one that changes what was "
-            f"simulated: {differences(manifest.config, config)}"
+            f"only values of {', '.join(POSTPROCESSING_KEYS)} can change, got one that changes "
+            f"what was simulated: {differences(manifest.config, config)}"
         )
     if config.split != manifest.config.split:
         objects = tuple(replace(entry, split=None) for entry in manifest.objects)

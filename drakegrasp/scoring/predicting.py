@@ -44,11 +44,11 @@ def propose(
     """Return 30 to 70 grasps for what a camera saw, the simplest first.
 
     The smallest rectangle around the points, seen from above, has a long side. The first palm looks
-    down on its centre and closes across the long side, as deep as the table and the hand's smallest
-    stand-off allow. The other palms from above are turned, higher or deeper by 20 mm, shifted along
-    the long side, tilted by 25 degrees, or have another spread. Then follow palms from all sides,
-    slanted by 55 degrees or horizontal, which close across the vertical. No two palms of one spread
-    are within 8 mm and 12 degrees.
+    down on its centre and closes across the narrow side, as deep as the table and the hand's
+    smallest stand-off allow. The other palms from above are turned, higher or deeper by 20 mm,
+    shifted along the long side, tilted by 25 degrees, or have another spread. Then follow palms
+    from all sides, slanted by 55 degrees or horizontal, which close across the vertical. No two
+    palms of one spread are within 8 mm and 12 degrees.
 
     Args:
         cloud: (n, 3), points of the object only, in {T} [m]; the table is z = 0.

@@ -261,7 +261,7 @@ def export_builtin(
     Raises:
         MeshError: If a name is unknown; then nothing is written.
     """
-    # Render up all names before anything is written.
+    # Look up all names before anything is written.
     config = config or BuiltinConfig()
     if names is None:
         chosen = draw_builtin(config)

@@ -96,7 +96,7 @@ class MujocoBaseline:
         self._find_addresses()
 
     def _find_addresses(self) -> None:
-        """Render up the places of bodies and joints in MuJoCo's arrays."""
+        """Look up the places of bodies and joints in MuJoCo's arrays."""
         m, hand = self._model, self._hand
         self._object, self._palm = m.body("object").id, m.body(hand.palm_link).id
         self._tips = [m.body(finger.fingertip).id for finger in hand.fingers]

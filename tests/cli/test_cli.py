@@ -25,6 +25,7 @@ from drakegrasp.cli import main as cli
 from drakegrasp.cli.arguments import What
 from drakegrasp.cli.console import say
 from drakegrasp.cli.main import COMMANDS
+from drakegrasp.config import preset_names
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
@@ -82,6 +83,25 @@ def test_help_of_all_has_the_first_line_of_each_command() -> None:
         assert own.startswith(f"Usage: drakegrasp {name}") and f"\n\n{summary}\n" in own
 
 
+@pytest.mark.parametrize(
+    ("name", "usage"),
+    [
+        ("merge", "[OPTIONS] INTO OUTS..."),
+        ("score", "--dataset FILE [OPTIONS] [PREDICTIONS]..."),
+        ("export", "--to FORMAT [OPTIONS] OUT [DIRECTORY]"),
+        ("stats", "[OPTIONS] OUT"),
+    ],
+)
+def test_usage_names_all_arguments(name: str, usage: str) -> None:
+    assert run(name, "--help").stdout.startswith(f"Usage: drakegrasp {name} {usage}\n")
+
+
+@pytest.mark.parametrize("name", ["build", "submit", "verify"])
+def test_help_names_all_presets(name: str) -> None:
+    (text,) = re.findall(r"the preset ([\w, ]+)\.", " ".join(run(name, "--help").stdout.split()))
+    assert sorted(re.split(", | or ", text)) == sorted(preset_names())
+
+
 def test_an_address_is_no_folder_of_this_machine(sound: Path) -> None:
     """Of functions; of commands see below."""
     with pytest.raises(DataError, match="must be a path of this machine, got an address"):
@@ -131,6 +151,7 @@ REFUSED = [
     ("verify a.npy --object o.obj --out a.npy/x.h5", "must be in a folder that can be"),
     ("verify a.npy --object o.obj --protocol dexgraspbench --out x.h5", "--out must be left out"),
     ("verify a.npy --object box.obj --units inch", 'Choose from: "m", "cm", "mm".'),
+    ("score --dataset other.h5 --frame mesh", 'Choose from: "object", "table", "camera", "world".'),
     ("verify a.npy --object o.obj --assets .", "--assets must be used with another --protocol"),
     *(
         (f"verify {words} --object box.obj --units cm --out deep/run.h5", said)
@@ -163,6 +184,7 @@ REFUSED = [
             "export {tmp} hf://datasets/x/y --to meshes",
             "merge s3:/x {tmp}",
             "score --dataset other.h5 --out https://x/y",
+            "score --dataset s3://x/y.hdf5",
             "audit memory://x",
         )
     ),
@@ -218,8 +240,8 @@ def test_help_fits_into_80_columns_and_is_not_cut() -> None:
     ]
     for words in pages:
         page = run(*words, "--help").stdout
-        # In the usage line dots mean "and more of these": [ARGS...]
-        assert "..." not in page.replace("[ARGS...]", "")
+        # In the usage line dots mean "and more of these".
+        assert "..." not in page.partition("\n\n")[2]
         assert max(map(len, page.splitlines())) <= 80
     # Also without docstrings.
     code = "from drakegrasp.cli.main import main; main(['build', '--help'])"
@@ -410,10 +432,12 @@ def save(folder: Path, *grasps: np.ndarray) -> Path:
 
 
 def test_choices_of_verify_and_score_are_those_of_the_code() -> None:
-    for command in ("verify", "score"):
+    # A file of postures on rows of a dataset cannot say which mesh it means.
+    of_rows = tuple(frame for frame in GRASP_FRAMES if frame != "mesh")
+    for command, frames in (("verify", GRASP_FRAMES), ("score", of_rows)):
         found = {each.name: each.get_choices() for each in arguments_of(command)}
         assert found["--split"] == SPLITS
-        assert found["--frame"] == GRASP_FRAMES
+        assert found["--frame"] == frames
 
 
 @pytest.mark.sim

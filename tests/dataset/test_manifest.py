@@ -138,8 +138,14 @@ def test_filters_may_change_but_not_the_physics(manifest: Manifest) -> None:
     changed = with_postprocessing(manifest, ["split.valid_fraction=0.2"])
     assert changed.config.split.valid_fraction == 0.2
     assert changed.objects == (MUG,)
+    # So may all that no shard depends on.
+    changed = with_postprocessing(manifest, ["scenes.views=2", "samples=7"])
+    assert (changed.config.scenes.views, changed.config.samples) == (2, 7)
     # Only what changes the simulation is told.
-    told = r"simulated: physics\.time_step \(0\.008 there, 0\.004 here\)$"
+    told = (
+        r"^only values of attempt_seconds, scenes, .*, verify can change, "
+        r".* simulated: physics\.time_step \(0\.008 there, 0\.004 here\)$"
+    )
     with pytest.raises(ValueError, match=told):
         with_postprocessing(manifest, ["physics.time_step=0.004", "filters.max_slip=0.001"])
 
