@@ -35,7 +35,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
-from drakegrasp.simulation.attempts import Attempts, unknown_objects
+from drakegrasp.simulation.attempts import GraspTable, unknown_objects
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -49,7 +49,7 @@ def build_dataset(
     units: str = "m",
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
-    postures: str | Path | Attempts | None = None,
+    postures: str | Path | GraspTable | None = None,
     read_as: Mapping[str, str] | None = None,
     client: Client | None = None,
     cluster: AbstractContextManager[Client] | None = None,
@@ -157,7 +157,7 @@ class _Work(NamedTuple):
     config: Config
     sources: list[MeshSource] | None
     names: list[str]
-    postures: Attempts | None
+    postures: GraspTable | None
 
 
 def _asked(
@@ -166,7 +166,7 @@ def _asked(
     units: str,
     manifest: str | Path | None,
     only: Sequence[str],
-    postures: str | Path | Attempts | None,
+    postures: str | Path | GraspTable | None,
     read_as: Mapping[str, str] | None,
 ) -> _Work:
     """Return what a build with these arguments of `build_dataset` does; nothing is written.
@@ -208,7 +208,7 @@ def known_work(
     units: str = "m",
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
-    postures: str | Path | Attempts | None = None,
+    postures: str | Path | GraspTable | None = None,
     read_as: Mapping[str, str] | None = None,
 ) -> list[str]:
     """Return lines on the work of a build as far as it is known before; nothing is written.

@@ -18,7 +18,7 @@ from drakegrasp.errors import GraspError, MeshError
 if TYPE_CHECKING:
     from drakegrasp.arithmetic import Array
     from drakegrasp.hand.description import Hand
-    from drakegrasp.simulation.attempts import Attempts
+    from drakegrasp.simulation.attempts import GraspTable
     from drakegrasp.vision.depth_image import View
 
 #: Suffixes of scenes, and of files of postures that are written.
@@ -173,7 +173,7 @@ def _validate_options(kind: str, options: dict[str, Any]) -> None:
 
 def _of_scenes(
     path: Path, split: str, simulate: int, workers: int | None, *, show: bool, **how: Any
-) -> tuple[Attempts, Hand]:
+) -> tuple[GraspTable, Hand]:
     """Return the grasps for the views of a split and their hand; print how many there are."""
     from drakegrasp.scoring.predicting import predict_scenes
 
@@ -197,7 +197,7 @@ def _of_object(
     overrides: tuple[str, ...],
     count: int | None,
     show: bool,
-) -> tuple[Attempts, Hand]:
+) -> tuple[GraspTable, Hand]:
     """Return the grasps for an object and their hand; print what to expect of them.
 
     They are in {T}, or in the frame of the view's camera if there is a view.

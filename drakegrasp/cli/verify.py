@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from drakegrasp.config import Config
     from drakegrasp.dataset.reader import PredictedRows
     from drakegrasp.protocols.postures import PostureResult, PostureTrials
-    from drakegrasp.simulation.attempts import Attempts, Rows
+    from drakegrasp.simulation.attempts import GraspTable, Rows
     from drakegrasp.verification.placing import PlacedGrasp
     from drakegrasp.verification.result import Verification
 
@@ -291,7 +291,7 @@ def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
     """
     from drakegrasp.exchange.attempts import read_predictions
     from drakegrasp.objects.sources import find_mesh
-    from drakegrasp.simulation.attempts import Attempts
+    from drakegrasp.simulation.attempts import GraspTable
     from drakegrasp.verification.placing import place_on_object
 
     assert target.mesh is not None
@@ -302,7 +302,7 @@ def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
     if table.of_row is not None:
         raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
     how: dict[str, Any] = {}
-    if isinstance(table, Attempts):
+    if isinstance(table, GraspTable):
         table = _of_object(table, name, path)
         named = table.objects
     else:
@@ -313,7 +313,7 @@ def _of_mesh(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config]:
     return place_on_object(ranked, placed, overrides=target.overrides, **how), config
 
 
-def _of_object(table: Attempts, name: str, path: Path) -> Attempts:
+def _of_object(table: GraspTable, name: str, path: Path) -> GraspTable:
     """Return the postures of an object, which they name or not; see `_of_mesh`."""
     own = [i for i, each in enumerate(table.objects) if each in ("", name)]
     others = sorted(set(table.objects) - {"", name})

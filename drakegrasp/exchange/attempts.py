@@ -1,7 +1,7 @@
 """Reads and writes files of postures, in our own layouts and those of other tools, as attempts.
 
 Input: a file or a folder of files, their hand, and the object or dataset rows that they are for.
-Output: one table, `Attempts`, or an error in one line that names the file and the mistake. Each
+Output: one `GraspTable`, or an error in one line that names the file and the mistake. Each
 format is an importer in the registry, found by the suffix of the file, which returns the arguments
 of `make_attempts`, and what of these is not for the table: `BESIDE`. This module reads our own
 layouts; the layouts of other tools are read by the modules named after them.
@@ -46,7 +46,7 @@ from drakegrasp.runtime.files import atomic_path
 from drakegrasp.simulation.attempts import (
     CONDITIONS,
     UNTOLD,
-    Attempts,
+    GraspTable,
     join_attempts,
     make_attempts,
     quaternion_poses,
@@ -86,7 +86,7 @@ def read_predictions(
     split: str | None = None,
     several: bool = False,
     read_as: Mapping[str, str] | None = None,
-) -> Attempts | ContactRows:
+) -> GraspTable | ContactRows:
     """Return the postures or the contacts of a file as a table; contacts do not name their objects.
 
     Args:
@@ -123,7 +123,7 @@ def read_attempts(
     *,
     of: str | GraspDataset | None = None,
     read_as: Mapping[str, str] | None = None,
-) -> Attempts:
+) -> GraspTable:
     """Return the postures of a file, or of a folder of files, as a table.
 
     An invalid row stays in the table, with the reason. An invalid file of a folder is one such row.
@@ -136,7 +136,7 @@ def read_attempts(
             a column `row`, or one grasp per row of the split, or exported samples, of which those
             of the split are used, or grasps that only name their object, each of which is used for
             every row of this object. Objects, and the camera for grasps in the frame "camera", are
-            those of the rows, and `Attempts.of_row` has the row numbers.
+            those of the rows, and `GraspTable.of_row` has the row numbers.
         read_as: Values for all postures. `frame` and `link` replace those of the file; `preshape`
             is used for rows that do not name one.
 
@@ -151,7 +151,7 @@ def read_attempts(
     if not path.is_dir():
         with named(path):
             return _made(hand, _named(_raw(path, hand, read_as), of))
-    found = list[Attempts | str]()
+    found = list[GraspTable | str]()
     for each in files_in(path):
         try:
             with named(each):
@@ -213,7 +213,7 @@ def read_arrays(path: Path, hand: Hand) -> dict[str, Any]:
     return _of_arrays(columns.read_arrays(path))
 
 
-def write_attempts(path: Path, table: Attempts, hand: Hand) -> None:
+def write_attempts(path: Path, table: GraspTable, hand: Hand) -> None:
     """Write postures as an HDF5 file of arrays in our own layout, which `read_attempts` reads.
 
     Attributes of the file state the hand and the version of drakegrasp. `link` is not written,
@@ -273,7 +273,7 @@ def _named(raw: dict[str, Any], of: str | None) -> dict[str, Any]:
     return {**raw, "objects": objects, "of_row": None}
 
 
-def _made(hand: Hand, raw: dict[str, Any]) -> Attempts:
+def _made(hand: Hand, raw: dict[str, Any]) -> GraspTable:
     """Return the table of the content of a file."""
     told = raw.get("hand")
     if told not in (None, hand.name):
@@ -297,9 +297,9 @@ def _is_called(hand: Hand, gripper: str) -> bool:
     return any(word in gripper.lower() for word in words)
 
 
-def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, str]) -> Attempts:
+def _for_rows(path: Path, hand: Hand, data: GraspDataset, read_as: Mapping[str, str]) -> GraspTable:
     """Return the postures that are for rows of a split, see `read_attempts`."""
-    tables, files = list[Attempts](), files_in(path) if path.is_dir() else [path]
+    tables, files = list[GraspTable](), files_in(path) if path.is_dir() else [path]
     without = set[str]()
     for each in files:
         with named(each):
@@ -353,7 +353,7 @@ def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
     return {**known, "of_row": of_row, "of_objects": of_objects}
 
 
-def _on_rows(raw: dict[str, Any], data: GraspDataset, hand: Hand) -> Attempts:
+def _on_rows(raw: dict[str, Any], data: GraspDataset, hand: Hand) -> GraspTable:
     """Return the postures of a file with the objects and cameras of their rows."""
     if raw.get("X_TC") is not None:
         raise GraspError("X_TC must be left out: the camera is that of the row; got it")

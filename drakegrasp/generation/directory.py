@@ -33,7 +33,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand, hand_places, moved_hand
 from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.simulation.candidates import validate_samplers
 from drakegrasp.simulation.drive import drive_of
 
@@ -43,7 +43,7 @@ BUILTIN = "builtin"
 SAMPLES_PER_OBJECT = 20
 
 
-def build_config(config: Config, postures: Attempts | None = None) -> Config:
+def build_config(config: Config, postures: GraspTable | None = None) -> Config:
     """Return the configuration of a build, which ends and names its postures.
 
     Without a target and a number of palm poses, samplers without an end would go on for hours, so
@@ -71,7 +71,7 @@ def build_config(config: Config, postures: Attempts | None = None) -> Config:
     return config
 
 
-def _with_postures(config: Config, postures: Attempts | None) -> Config:
+def _with_postures(config: Config, postures: GraspTable | None) -> Config:
     """Return a configuration that names the given postures.
 
     Raises:

@@ -47,7 +47,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
-from drakegrasp.simulation.attempts import Attempts, misfits
+from drakegrasp.simulation.attempts import GraspTable, misfits
 from drakegrasp.table import Table
 
 #: Outcomes of attempts that ended because of the machine or an error of the simulator.
@@ -170,7 +170,7 @@ def build(
     sources: Sequence[MeshSource],
     execute: Executor,
     *,
-    postures: Attempts | None = None,
+    postures: GraspTable | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -206,7 +206,7 @@ class _Build:
         self,
         directory: BuildDirectory,
         execute: Executor,
-        postures: Attempts | None,
+        postures: GraspTable | None,
         pool: WorkerPool | None,
         *,
         show: bool,
@@ -485,7 +485,7 @@ def _set_units(target: Target, manifest: Manifest) -> None:
         target.set_units(entry.name, units, endless=endless)
 
 
-def _refused(postures: Attempts, manifest: Manifest) -> str:
+def _refused(postures: GraspTable, manifest: Manifest) -> str:
     """Return which rows of the postures are not tried, and why; empty if all are tried.
 
     Raises:

@@ -25,7 +25,7 @@ from drakegrasp.objects.sources import MeshSource, read_source, source_sha256
 from drakegrasp.runtime.environment import one_thread, release_memory
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import PREPARE, Verdict, inject_fault, open_journal
-from drakegrasp.simulation.attempts import Attempts, given_candidates
+from drakegrasp.simulation.attempts import GraspTable, given_candidates
 from drakegrasp.simulation.candidates import Drawing
 from drakegrasp.simulation.settle import find_resting_poses
 
@@ -49,7 +49,7 @@ class PrepareTask(DatasetTask):
     """
 
     source: MeshSource
-    postures: Attempts | None = None
+    postures: GraspTable | None = None
     restartable: bool
 
     @property
@@ -205,7 +205,7 @@ def _prepared_entry(task: PrepareTask, read: tuple[bytes, str]) -> ObjectEntry |
 def prepare(
     source: MeshSource,
     config: Config,
-    postures: Attempts | None = None,
+    postures: GraspTable | None = None,
     read: tuple[bytes, str] | None = None,
 ) -> PreparedObject:
     """Return a mesh as an object at rest on the table, with its palm poses.

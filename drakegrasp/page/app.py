@@ -42,7 +42,7 @@ from drakegrasp.dataset.rejections import (
 from drakegrasp.dataset.trials import stamp
 from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.foreign_files import parse_json
-from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.attempts import AttemptGallery
 from drakegrasp.page.gallery import Gallery, render
 from drakegrasp.page.predictions import Predictions, result_file
 from drakegrasp.page.renders import HandView, object_surface, read_render
@@ -167,7 +167,7 @@ class Inspection:
 
     def galleries(self) -> list[type[Gallery]]:
         """Return the galleries that there are."""
-        found: list[type[Gallery]] = [Attempts]
+        found: list[type[Gallery]] = [AttemptGallery]
         if Predictions in self._fixed:
             found.append(Predictions)
         if os.path.lexists(self._scenes):
@@ -184,8 +184,8 @@ class Inspection:
         if kind not in self.galleries():
             how = "drakegrasp scenes makes them" if kind is Scenes else "give --predictions"
             raise HTTPException(404, f"there are no {kind.NOUN}s: {how}")
-        if kind is Attempts:
-            return Attempts(self.snapshot, self.decisions.read(), self.token)
+        if kind is AttemptGallery:
+            return AttemptGallery(self.snapshot, self.decisions.read(), self.token)
         with self._lock:
             if kind not in self._fixed:
                 self._fixed[kind] = Scenes(self._scenes, self.snapshot)
@@ -209,7 +209,7 @@ class Inspection:
         _ = self.hand.surfaces
         image, mask = np.zeros((4, 2, 2), np.float32), np.zeros((2, 2), np.uint8)
         strip_png(image, mask, far=1.0)
-        _gallery(Attempts, self, "", {})
+        _gallery(AttemptGallery, self, "", {})
 
 
 # Answers: pages, pictures and meshes, by the {name} in their addresses.
@@ -241,7 +241,7 @@ def _view(inspection: Inspection, name: str, params: Params) -> Response:
 def _strip(inspection: Inspection, name: str, params: Params) -> Response:
     snapshot = inspection.snapshot
     number, _, camera = name.rpartition("-")
-    i = inspection.table(Attempts).find(number)
+    i = inspection.table(AttemptGallery).find(number)
     found = _there(None if i is None else read_render(snapshot, i, camera), "image")
     png = strip_png(found.image, found.mask, far=snapshot.config.camera.far)
     return Response(png, media_type="image/png")
@@ -274,8 +274,11 @@ def _there(found: Any, noun: str) -> Any:
 Answer: TypeAlias = Callable[[Inspection, str, Params], Response]
 #: Function that answers each address: galleries and rows of tables, and parts of pages.
 PAGES: dict[str, Answer] = {
-    **{kind.HOME: partial(_gallery, kind) for kind in (Attempts, Predictions, Scenes)},
-    **{f"/{kind.ROW}/{{name}}": partial(_row, kind) for kind in (Attempts, Predictions, Scenes)},
+    **{kind.HOME: partial(_gallery, kind) for kind in (AttemptGallery, Predictions, Scenes)},
+    **{
+        f"/{kind.ROW}/{{name}}": partial(_row, kind)
+        for kind in (AttemptGallery, Predictions, Scenes)
+    },
     "/view/{name}.png": _view,
     "/strip/{name}.png": _strip,
     "/mesh/{name}.json": _mesh,
@@ -286,14 +289,14 @@ PAGES: dict[str, Answer] = {
 
 
 def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
-    table, decision = inspection.table(Attempts), content.get("decision")
+    table, decision = inspection.table(AttemptGallery), content.get("decision")
     i = table.find(str(content.get("label")))
     if i is None or not table.table.held[i]:
         raise HTTPException(404, "the attempt must be a success of the dataset")
     if decision not in ("rejected", ""):
         raise HTTPException(400, f"decision must be rejected or empty, got {decision!r}")
     found = inspection.decisions.decide(inspection.snapshot.key(i), decision)
-    counts = Attempts(inspection.snapshot, found).counts()
+    counts = AttemptGallery(inspection.snapshot, found).counts()
     return JSONResponse({"label": i, "decision": decision, "counts": counts})
 
 
@@ -306,7 +309,7 @@ def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
             "name": printable(str(undone.key)),
             "label": inspection.snapshot.find(undone.key),
             "decision": undone.before,
-            "counts": Attempts(inspection.snapshot, inspection.decisions.read()).counts(),
+            "counts": AttemptGallery(inspection.snapshot, inspection.decisions.read()).counts(),
         }
     )
 

@@ -42,7 +42,7 @@ KEPT = ("removal", Removal.KEPT.label)
 REASONS, REASON_SHARE = 2, 0.75
 
 
-class Attempts(Gallery):
+class AttemptGallery(Gallery):
     """The attempts of a dataset.
 
     Args:

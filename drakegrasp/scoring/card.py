@@ -32,7 +32,7 @@ from drakegrasp.scoring.measures import (
     resample,
 )
 from drakegrasp.scoring.references import REFERENCES
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspTable
 
 #: Name of the format of the card.
 FORM = "drakegrasp-score-1"
@@ -146,7 +146,7 @@ def _set_of(
 ) -> dict[str, Any]:
     """Return the description of a set on the card."""
     table, reference = judged.table, REFERENCES.get(judged.name)
-    of_postures = any(isinstance(ranked, Attempts) for ranked in judged.ranked)
+    of_postures = any(isinstance(ranked, GraspTable) for ranked in judged.ranked)
     return {
         "what": reference.words if reference else "postures" if of_postures else "predictions",
         "files": [{"name": r.file, "sha256": r.sha256} for r in judged.ranked],

@@ -1,7 +1,7 @@
 """Predictions: from what a camera saw to grasps, the best first. No network is needed.
 
 Input: an object's visible points in {T}, where the table is z = 0, or the views of scenes. Output:
-`Attempts`, which `exchange.attempts.write_attempts` writes, a robot executes, a build tries and a
+`GraspTable`, which `exchange.attempts.write_attempts` writes, a robot executes, a build tries and a
 score judges. `propose` puts palms around the points, the fixed ones of `simulation.palms`, which
 the sampler `closing` also tries on whole objects; `predict` orders them (`scoring.ranking`) and
 states a confidence.
@@ -31,7 +31,7 @@ from drakegrasp.mesh.cloud import hull_solid, read_cloud
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.scoring.ranking import Ranking, chosen_hand, rank
-from drakegrasp.simulation.attempts import Attempts, join_attempts, make_attempts
+from drakegrasp.simulation.attempts import GraspTable, join_attempts, make_attempts
 from drakegrasp.simulation.closing import closed_on
 from drakegrasp.simulation.palms import Palms
 from drakegrasp.simulation.posture import joint_order
@@ -40,7 +40,7 @@ from drakegrasp.vision.depth_image import View, cloud_from_depth
 
 def propose(
     cloud: npt.ArrayLike, hand: Hand | str | None = None, *, name: str = "seen"
-) -> Attempts:
+) -> GraspTable:
     """Return 30 to 70 grasps for what a camera saw, the simplest first.
 
     The smallest rectangle around the points, seen from above, has a long side. The first palm looks
@@ -102,7 +102,7 @@ def predict(
     simulate: int,
     count: int | None = None,
     name: str = "seen",
-) -> tuple[Attempts, Ranking]:
+) -> tuple[GraspTable, Ranking]:
     """Return grasps for what a camera saw of an object, the best first, and their ranking.
 
     Args:
@@ -137,7 +137,7 @@ def predict_scenes(
     overrides: Sequence[str] = (),
     execute: Executor = run_here,
     report: Report = silent,
-) -> tuple[Attempts, int, Hand]:
+) -> tuple[GraspTable, int, Hand]:
     """Return grasps for all views of a split, in the frames of their objects.
 
     The rows of the views are those of `drakegrasp score`, see `dataset.scenes.SceneRows`.
@@ -165,7 +165,7 @@ def predict_scenes(
         raise GraspError(f"{path}: {data.emptiness}")
     config = override_config(read_manifest(data.path.parent).config, overrides)
     work = partial(_predict_view, config, simulate, count)
-    tables = list[Attempts]()
+    tables = list[GraspTable]()
     for row, table in enumerate(in_order(execute)(work, _views(data))):
         if table is not None:
             tables.append(replace(table, of_row=np.full(len(table), row)))
@@ -203,7 +203,7 @@ def _views(data: SceneDataset) -> Iterator[_SceneView]:
 
 def _predict_view(
     config: Config, simulate: int, count: int | None, seen: _SceneView
-) -> Attempts | None:
+) -> GraspTable | None:
     """Return grasps for a view in {O}; None if it shows too little of its object.
 
     Raises:

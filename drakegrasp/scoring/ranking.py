@@ -34,7 +34,7 @@ from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
 from drakegrasp.objects.model import object_of
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt, usual_conditions
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.simulation.closing import close_on
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import start_of
@@ -117,7 +117,7 @@ class Ranking:
 
 
 def rank(
-    proposals: Attempts | npt.ArrayLike,
+    proposals: GraspTable | npt.ArrayLike,
     cloud: npt.ArrayLike,
     hand: Hand | str | None = None,
     *,
@@ -218,14 +218,14 @@ def measured(
 
 
 def _read_proposals(
-    proposals: Attempts | npt.ArrayLike, hand: Hand, spread: float
-) -> Attempts | Array:
+    proposals: GraspTable | npt.ArrayLike, hand: Hand, spread: float
+) -> GraspTable | Array:
     """Return postures, or palm poses (n, 4, 4), that fit a hand.
 
     Raises:
         GraspError: If they or the spread do not.
     """
-    if isinstance(proposals, Attempts):
+    if isinstance(proposals, GraspTable):
         joints, expected = proposals.q_grasp.shape[1], len(hand.joint_names)
         if joints != expected:
             raise GraspError(
@@ -247,9 +247,9 @@ def chosen_hand(hand: Hand | str | None) -> Hand:
     return load_hand() if hand is None else load_hand(hand)
 
 
-def _starts(proposals: Attempts | Array, hand: Hand, spread: float) -> dict[int, Attempt]:
+def _starts(proposals: GraspTable | Array, hand: Hand, spread: float) -> dict[int, Attempt]:
     """Return the start of each valid proposal, by its index, with {T} as its object's frame."""
-    if not isinstance(proposals, Attempts):
+    if not isinstance(proposals, GraspTable):
         preshape = 0 if hand.preshapes else None
         made = (Attempt(X_OG=X, spread=spread, preshape=preshape) for X in proposals)
         return dict(enumerate(made))

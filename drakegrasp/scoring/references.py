@@ -22,7 +22,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.scoring.predicting import propose
 from drakegrasp.scoring.ranking import rank
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.attempts import Attempts, make_attempts
+from drakegrasp.simulation.attempts import GraspTable, make_attempts
 from drakegrasp.verification.placing import dataset_config
 from drakegrasp.vision.camera import unproject
 
@@ -182,7 +182,7 @@ def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     return pack_grasp(transform_points(X_CT, points), rotate_vectors(X_CT, normals))
 
 
-def closing(scene: Scene) -> Attempts:
+def closing(scene: Scene) -> GraspTable:
     """Return for each row the grasp of `propose` that `rank` puts first, for the visible points.
 
     A row for which no grasp can be proposed is invalid, with the reason.
@@ -214,7 +214,7 @@ def closing(scene: Scene) -> Attempts:
     )
 
 
-def _chosen(p_TQ: Array, hand: Hand) -> Attempts:
+def _chosen(p_TQ: Array, hand: Hand) -> GraspTable:
     """Return the one grasp for points (n, 3) in {T} that `rank` puts first."""
     grasps = propose(p_TQ, hand)
     return grasps.at([int(rank(grasps, p_TQ, hand).order[0])])
@@ -224,7 +224,7 @@ def _chosen(p_TQ: Array, hand: Hand) -> Attempts:
 class Reference:
     """A reference: the function that makes its rows, a description, whether it needs training."""
 
-    make: Callable[[Scene], Array | Attempts]
+    make: Callable[[Scene], Array | GraspTable]
     words: str
     trained: bool = True
 

@@ -26,7 +26,7 @@ from drakegrasp.scoring.measures import Grouping, Judged
 from drakegrasp.scoring.references import REFERENCES, Scene
 from drakegrasp.scoring.verdict import Verdict, VerdictFile, rank_array, verdict_key
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.attempts import Attempts, GraspRows, Rows, join_rows
+from drakegrasp.simulation.attempts import GraspRows, GraspTable, Rows, join_rows
 
 #: Tries n attempts on rows (n,), and calls back with the index and the verdict of each.
 Verify: TypeAlias = Callable[[GraspRows, Sequence[int], Callable[[int, Verdict], None]], object]
@@ -215,7 +215,7 @@ def _verdicts(
     Contacts of all tables are tried together, postures table by table.
     """
     keys = [_keys(each, data, settings) for each in tables]
-    contacts = [k for k, each in enumerate(tables) if not isinstance(each, Attempts)]
+    contacts = [k for k, each in enumerate(tables) if not isinstance(each, GraspTable)]
     postures = [[k] for k in range(len(tables)) if k not in contacts]
     for part in [contacts, *postures] if contacts else postures:
         table = join_rows([tables[k] for k in part])
@@ -227,7 +227,7 @@ def _keys(table: GraspRows, data: GraspDataset, settings: Mapping[str, Any]) -> 
     """Return the key of each prediction under these settings."""
     # The files of the two cameras have the same content.
     frame, shapes = f"{data.content} {data.camera}", [""] * len(table)
-    if isinstance(table, Attempts):
+    if isinstance(table, GraspTable):
         # Palm poses alone may differ only in their preshape.
         frame = f"{frame} posture in {table.frame}"
         shapes = [name and f" of {name}" for name in table.preshape]

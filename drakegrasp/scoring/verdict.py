@@ -1,8 +1,8 @@
 """Ranked predictions, and the part of each verdict that a score stores.
 
 Input: arrays and files with m predictions for each row of a split, and verdicts of any rule on
-them. Output: `Attempts` in the order of rows and ranks, and a `Verdict` for each. Ranks follow the
-stated confidence, or the given order if none is stated. Verdicts are stored as JSON lines under
+them. Output: a `GraspTable` in the order of rows and ranks, and a `Verdict` for each. Ranks follow
+the stated confidence, or the given order if none is stated. Verdicts are stored as JSON lines under
 a key of what was tried, so an interrupted score can continue.
 """
 
@@ -27,7 +27,7 @@ from drakegrasp.frames import Array, as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.protocols.protocol import PostureVerdict
-from drakegrasp.simulation.attempts import EACH, Attempts, GraspRows, Rows, ranked
+from drakegrasp.simulation.attempts import EACH, GraspRows, GraspTable, Rows, ranked
 from drakegrasp.verification.placing import dataset_config
 from drakegrasp.verification.prediction import read_several
 from drakegrasp.verification.result import Verification
@@ -83,7 +83,7 @@ def rank_file(
     hand = load_hand(dataset_config(data).hand_source)
     table = read_predictions(path, hand, of=data, several=True, read_as=read_as)
     with named(path):
-        if isinstance(table, Attempts) and EACH in table.preshape:
+        if isinstance(table, GraspTable) and EACH in table.preshape:
             raise GraspError(
                 f"preshape must be one for a score, which tries nothing twice, got {EACH}"
             )

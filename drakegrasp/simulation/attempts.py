@@ -1,9 +1,9 @@
-"""Attempts from outside: many postures of several objects, and the palm poses of a build from them.
+"""Grasps from outside: many postures of several objects, and the palm poses of a build from them.
 
-Input: what a file, a network or another tool states about n grasps. Output: one table, `Attempts`.
-A bad row keeps the reason why it is bad and does not affect other rows. The table is plain data and
-can be sent to another process. A build makes its `Candidates` and the `Attempt` of each row from
-it. Verification and scoring put its rows on their objects.
+Input: what a file, a network or another tool states about n grasps. Output: one `GraspTable`. A bad
+row keeps the reason why it is bad and does not affect other rows. The table is plain data and can
+be sent to another process. A build makes its `Candidates` and the `Attempt` of each row from it.
+Verification and scoring put its rows on their objects.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _DECIDING = (
 )
 #: Attributes of a table that apply to all its rows together.
 _OF_ALL = ("frame", "file", "sha256", "without_rows")
-#: Conditions that an attempt may have drawn, in the order of `Attempts.conditions`.
+#: Conditions that an attempt may have drawn, in the order of `GraspTable.conditions`.
 CONDITIONS = ("friction_hand", "friction_table", "mass")
 
 
@@ -123,7 +123,7 @@ Rows = TypeVar("Rows", bound=GraspRows)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Attempts(GraspRows):
+class GraspTable(GraspRows):
     """n postures of hands with j joints in the plant's order, built by `make_attempts`.
 
     Attributes:
@@ -159,7 +159,7 @@ class Attempts(GraspRows):
     preshape: tuple[str, ...]
     conditions: Array
 
-    def of_object(self, name: str) -> Attempts:
+    def of_object(self, name: str) -> GraspTable:
         """Return the valid rows of an object, in their order."""
         said = zip(self.objects, self.invalid, strict=True)
         return self.at([i for i, (each, reason) in enumerate(said) if each == name and not reason])
@@ -278,7 +278,7 @@ def make_attempts(
     of_row: Any = None,
     confidence: Any = None,
     alone: npt.ArrayLike = False,
-) -> Attempts:
+) -> GraspTable:
     """Return a table of postures, after checking each row separately.
 
     Args:
@@ -303,8 +303,8 @@ def make_attempts(
         preshape: (n,), names of the hand's preshapes; empty if all fingers close. A palm pose alone
             may be tried in `EACH`.
         conditions: (n, 3), `CONDITIONS`; NaN for those of the object and of the configuration.
-        of_row: (n,), see `Attempts`.
-        confidence: (n,), see `Attempts`.
+        of_row: (n,), see `GraspTable`.
+        confidence: (n,), see `GraspTable`.
         alone: (n,), whether a row is a palm pose alone, without joints at any stage.
 
     Raises:
@@ -335,7 +335,7 @@ def make_attempts(
         q[stage] = _numbers(q[stage], size, stage, bad, some=True)
         for i in np.flatnonzero(palms & ~np.isnan(q[stage]).all(axis=1)):
             bad[i] = bad[i] or f"{stage} must be {BESIDE_GRASP}"
-    return Attempts(
+    return GraspTable(
         objects=tuple(objects),
         X_FG=_poses(X_FG, count, "the palm's pose", bad),
         q_grasp=_numbers(q["q_grasp"], size, "q_grasp", bad, some=palms),
@@ -440,7 +440,7 @@ def _conditions(told: npt.ArrayLike | None, count: int, bad: list[str]) -> Array
     return known
 
 
-def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
+def join_attempts(parts: Sequence[GraspTable | str]) -> GraspTable:
     """Return the concatenated rows of some tables.
 
     Args:
@@ -449,7 +449,7 @@ def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
     Raises:
         GraspError: If no part is a table, or the tables are in different frames.
     """
-    tables = [part for part in parts if isinstance(part, Attempts)]
+    tables = [part for part in parts if isinstance(part, GraspTable)]
     if not tables:
         raise GraspError(str(parts[0]))
     if len(frames := {table.frame for table in tables}) > 1:
@@ -457,7 +457,7 @@ def join_attempts(parts: Sequence[Attempts | str]) -> Attempts:
 
     # The numbers of a bad row do not matter, because nothing reads them.
     nothing = replace(tables[0].at([0]), objects=("",), said=("",))
-    whole = [p if isinstance(p, Attempts) else replace(nothing, invalid=(p,)) for p in parts]
+    whole = [p if isinstance(p, GraspTable) else replace(nothing, invalid=(p,)) for p in parts]
     return join_rows(whole)
 
 
@@ -638,13 +638,13 @@ def _poses(
     return array
 
 
-def unknown_objects(table: Attempts, names: Sequence[str]) -> list[str]:
+def unknown_objects(table: GraspTable, names: Sequence[str]) -> list[str]:
     """Return for each row the reason why its object does not exist; empty if it exists."""
     known, must = set(names), f"object must be one of {listed(list(names))}"
     return ["" if each in known else f"{must}, got {each!r}" for each in table.objects]
 
 
-def misfits(table: Attempts, name: str, scale: float, poses: Array) -> list[str]:
+def misfits(table: GraspTable, name: str, scale: float, poses: Array) -> list[str]:
     """Return for each row of an object why it does not fit the object; empty for other rows.
 
     Args:
@@ -676,7 +676,7 @@ _IN_PLAN = ("q_grasp", "q_pregrasp", "q_squeeze", "row", "preshape")
 
 
 def given_candidates(
-    model: ObjectModel, X_TO: Array, table: Attempts, config: Config
+    model: ObjectModel, X_TO: Array, table: GraspTable, config: Config
 ) -> Candidates:
     """Return the postures of an object as its palm poses, up to `candidates.max` of them.
 
@@ -714,7 +714,7 @@ def given_candidates(
     )
 
 
-def _posture(rows: Attempts | Table, i: int, X_OG: Array) -> Posture:
+def _posture(rows: GraspTable | Table, i: int, X_OG: Array) -> Posture:
     """Return the posture of a row; NaN means that it lacks a stage."""
     grasp, before, after = (
         None if np.isnan(q).any() else q

@@ -68,8 +68,8 @@ class Candidates:
             ray to each stand-off, with drawn spreads.
         preshape_index: (n,), index of the preshape of each palm; -1 if there is none, or it is
             drawn.
-        postures: Columns `q_grasp`, `q_pregrasp`, `q_squeeze`, `row` and `preshape` of `Attempts`,
-            if the poses come from outside; None if they come from samplers.
+        postures: Columns `q_grasp`, `q_pregrasp`, `q_squeeze`, `row` and `preshape` of a
+            `GraspTable`, if the poses come from outside; None if they come from samplers.
     """
 
     X_OG: Array

@@ -37,8 +37,8 @@ from drakegrasp.hand.settings import override_config
 from drakegrasp.simulation.attempts import (
     CONDITIONS,
     UNTOLD,
-    Attempts,
     GraspRows,
+    GraspTable,
     misfits,
     unknown_objects,
 )
@@ -195,7 +195,7 @@ def place_on_object(
     Raises:
         GraspError: As `drakegrasp.verify_grasps`.
     """
-    if not isinstance(grasps, Attempts):
+    if not isinstance(grasps, GraspTable):
         return contacts_on_object(grasps, placed, frame=frame)
     stands, config = [placed], placed.config
     if config.objects.resting_poses > 1:
@@ -223,7 +223,7 @@ def place_on_rows(
     Raises:
         GraspError: As `contacts_on_rows`, or if postures are in the frames of mesh files.
     """
-    if not isinstance(grasps, Attempts):
+    if not isinstance(grasps, GraspTable):
         how: dict[str, Any] = {"drawn": drawn, "frame": frame, "overrides": overrides}
         return contacts_on_rows(grasps, dataset, rows, config=config, **how)
     _validate_no_mesh_frame(grasps)
@@ -233,7 +233,7 @@ def place_on_rows(
 
 
 def place_on_dataset(
-    table: Attempts, out: Path, config: Config | None = None, *, overrides: Sequence[str] = ()
+    table: GraspTable, out: Path, config: Config | None = None, *, overrides: Sequence[str] = ()
 ) -> list[PlacedGrasp]:
     """Return postures on the objects of a dataset that they name.
 
@@ -321,7 +321,7 @@ def _placed_contacts(
     )
 
 
-def _validate_no_mesh_frame(table: Attempts) -> None:
+def _validate_no_mesh_frame(table: GraspTable) -> None:
     """Reject postures in frames of meshes: a file cannot say which of both meshes it means.
 
     Meshes of a dataset are exported in {O}.
@@ -334,7 +334,7 @@ def _validate_no_mesh_frame(table: Attempts) -> None:
 
 
 def _on_stands(
-    table: Attempts,
+    table: GraspTable,
     rows: Iterable[int],
     stands: Sequence[PlacedObject],
     config: Config,
@@ -361,7 +361,7 @@ def _on_stands(
 
 
 def _stands_of(
-    table: Attempts, i: int, stands: Sequence[PlacedObject], given: list[PlacedObject]
+    table: GraspTable, i: int, stands: Sequence[PlacedObject], given: list[PlacedObject]
 ) -> Sequence[PlacedObject]:
     """Return the object in each pose that a row is tried in.
 
@@ -385,7 +385,7 @@ def _stands_of(
     return given[-1:]
 
 
-def _posture_of_row(table: Attempts, i: int, placed: PlacedObject, config: Config) -> PlacedGrasp:
+def _posture_of_row(table: GraspTable, i: int, placed: PlacedObject, config: Config) -> PlacedGrasp:
     """Return a posture on the object of its row, whatever pose of the object it states itself."""
     row = replace(
         table.at([i]),
@@ -398,7 +398,7 @@ def _posture_of_row(table: Attempts, i: int, placed: PlacedObject, config: Confi
 
 
 def _placed_posture(
-    table: Attempts, i: int, index: int, stands: tuple[PlacedObject, ...], config: Config
+    table: GraspTable, i: int, index: int, stands: tuple[PlacedObject, ...], config: Config
 ) -> PlacedGrasp:
     """Return the posture of a row, which is number `index` of the caller's grasps."""
     hand = load_hand(config.hand_source)

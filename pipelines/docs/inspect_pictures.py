@@ -17,7 +17,7 @@ import uvicorn
 from playwright.sync_api import sync_playwright
 
 from drakegrasp.page.app import Inspection, listen, make_app
-from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.attempts import AttemptGallery
 from drakegrasp.page.predictions import Predictions
 from drakegrasp.page.scenes import Scenes
 
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
         page.set_default_timeout(PATIENCE)
         for kind, name, path in (
-            (Attempts, "gallery", "/?split=samples"),
+            (AttemptGallery, "gallery", "/?split=samples"),
             (Scenes, "scenes", "/scenes?split=train&sort=tested"),
             (Predictions, "predictions", "/predictions?verdict=held&sort=true_error"),
         ):

@@ -50,7 +50,7 @@ from drakegrasp.protocols.postures import prepare_trials, verify_postures
 from drakegrasp.scoring.ranking import chances
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.shapes.catalog import builtin_object, draw_builtin
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.vision.camera import look_at
 from drakegrasp.vision.depth_image import View, cloud_from_depth
@@ -179,7 +179,7 @@ def measure(name: str, placed: PlacedObject, protocol: str | None) -> dict[str, 
     }
 
 
-def tried(placed: PlacedObject, grasps: Attempts, i: int) -> list[float]:
+def tried(placed: PlacedObject, grasps: GraspTable, i: int) -> list[float]:
     """Return whether a grasp is held, and whether it is a sample."""
     trial = dg.run_trial(placed, grasps.posture(i, placed.X_TO_simulated))
     removal = judge_sample(placed.model, trial, placed.config)
@@ -187,7 +187,7 @@ def tried(placed: PlacedObject, grasps: Attempts, i: int) -> list[float]:
 
 
 def tried_by(
-    protocol: str, placed: PlacedObject, grasps: Attempts, rows: Sequence[int]
+    protocol: str, placed: PlacedObject, grasps: GraspTable, rows: Sequence[int]
 ) -> list[bool]:
     """Return whether grasps are successes by a protocol in MuJoCo."""
     hand = load_hand(placed.config.hand_source)

@@ -25,7 +25,7 @@ from helpers.tiers import in_second_tier
 
 from drakegrasp.dataset.manifest import DIGEST, manifest_digest
 from drakegrasp.hand.file_format import MODELS
-from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.attempts import AttemptGallery
 
 MANIFEST, REJECT = "manifest.json", "reject.json"
 SHARD = "shards/1_box_a/0000000-0000002.h5"
@@ -86,11 +86,11 @@ def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def make_pages(server: uvicorn.Server, sockets: object) -> None:
         inspection = server.config.app.state.inspection  # type: ignore[union-attr]
-        table, query = inspection.table(Attempts), Attempts.query({"outcome": "any"})
+        table, query = inspection.table(AttemptGallery), AttemptGallery.query({"outcome": "any"})
         chosen = table.select(query)
-        table.gallery_page(query, chosen, [Attempts])
+        table.gallery_page(query, chosen, [AttemptGallery])
         for i in chosen.tolist():
-            table.row_page(i, query, chosen, [Attempts], inspection.hand)
+            table.row_page(i, query, chosen, [AttemptGallery], inspection.hand)
 
     monkeypatch.setattr(uvicorn.Server, "run", make_pages)
 

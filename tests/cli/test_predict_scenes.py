@@ -20,7 +20,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.scoring.predicting import predict
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.vision.depth_image import cloud_from_depth
 
 pytestmark = pytest.mark.sim
@@ -48,7 +48,7 @@ def cloud(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def own(cloud: Path) -> Attempts:
+def own(cloud: Path) -> GraspTable:
     """The grasps for that cloud."""
     return predict(np.load(cloud), None, load_config("fast"), simulate=0)[0]
 
@@ -63,7 +63,7 @@ def predicted(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_grasps_of_scenes_are_those_of_their_views(
-    scenes: Path, predicted: Path, own: Attempts
+    scenes: Path, predicted: Path, own: GraspTable
 ) -> None:
     """Each row has its best grasps, in the frame of its object."""
     rows = SceneRows(scenes, split="train")
@@ -126,7 +126,7 @@ def test_workers_change_nothing(scenes: Path, predicted: Path, tmp_path: Path) -
     assert (tmp_path / "by 2.h5").read_bytes() == predicted.read_bytes()
 
 
-def test_a_cloud_may_be_in_any_unit(cloud: Path, own: Attempts, tmp_path: Path) -> None:
+def test_a_cloud_may_be_in_any_unit(cloud: Path, own: GraspTable, tmp_path: Path) -> None:
     points, path, out = np.load(cloud), tmp_path / "cloud.ply", tmp_path / "grasps.h5"
     lines = "\n".join(" ".join(f"{1e3 * x:.6f}" for x in point) for point in points)
     path.write_text(

@@ -20,7 +20,7 @@ from drakegrasp.exchange.attempts import holds_postures, read_attempts, write_at
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.simulation.attempts import CONDITIONS, Attempts, quaternion_poses, ranked
+from drakegrasp.simulation.attempts import CONDITIONS, GraspTable, quaternion_poses, ranked
 from drakegrasp.simulation.posture import joint_order
 
 HAND = load_hand("allegro")
@@ -66,7 +66,7 @@ def write_hdf5(folder: Path, content: dict[str, Any] | None = None) -> Path:
     return folder / "p.h5"
 
 
-def read_own(folder: Path, hand: Hand, **content: Any) -> Attempts:
+def read_own(folder: Path, hand: Hand, **content: Any) -> GraspTable:
     """Return the postures of a file of arrays, p.npz."""
     np.savez(folder / "p.npz", **content)
     return read_attempts(folder / "p.npz", hand)
@@ -202,7 +202,7 @@ def write_dictionary(path: Path, content: Any) -> Path:
     return path
 
 
-def assert_both(table: Attempts) -> None:
+def assert_both(table: GraspTable) -> None:
     assert (table.objects, table.frame) == (tuple(OBJECTS), "mesh")
     np.testing.assert_allclose(table.X_FG, POSES, atol=1e-9)
     np.testing.assert_array_equal(table.q_grasp, GRASP)

@@ -34,7 +34,7 @@ from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Source
-from drakegrasp.simulation.attempts import Attempts, make_attempts, unknown_objects
+from drakegrasp.simulation.attempts import GraspTable, make_attempts, unknown_objects
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import place_object
 from drakegrasp.simulation.posture import joint_order
@@ -58,7 +58,7 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
+def table(tmp_path_factory: pytest.TempPathFactory) -> GraspTable:
     """Rows of the cube: held by the hand's motors, held by own ones, inside it, below the table."""
     model = box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3, NAME)
     attempt = from_above(model, STANDOFF)
@@ -84,14 +84,14 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Attempts:
     )
 
 
-def built(meshes: Path, out: Path, table: Attempts, config: Config | None = None) -> Path:
+def built(meshes: Path, out: Path, table: GraspTable, config: Config | None = None) -> Path:
     config = build_config(config or CONFIG, table)
     build(meshes, out, config, postures=table)
     return out
 
 
 @pytest.fixture(scope="module")
-def dataset(meshes: Path, table: Attempts, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(meshes: Path, table: GraspTable, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(meshes, tmp_path_factory.mktemp("built") / "out", table)
 
 

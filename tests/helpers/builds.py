@@ -18,7 +18,7 @@ from drakegrasp.generation.directory import build_config, open_directory
 from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.executor import Executor, WorkerPool, run_here
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspTable
 
 #: Six units of half a second for each object, so that none goes with another and a build can be
 #: stopped in time; of six attempts one succeeds.
@@ -48,7 +48,7 @@ def build(
     config: Config,
     execute: Executor = run_here,
     *,
-    postures: Attempts | None = None,
+    postures: GraspTable | None = None,
     pool: WorkerPool | None = None,
     show: bool = False,
 ) -> BuildReport:

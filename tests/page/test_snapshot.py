@@ -18,7 +18,7 @@ from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
-from drakegrasp.page.attempts import Attempts
+from drakegrasp.page.attempts import AttemptGallery
 from drakegrasp.page.renders import THUMBNAIL, contact_dots, read_render, read_rows
 from drakegrasp.page.snapshot import FEATURES, Snapshot, read_snapshot
 from drakegrasp.vision.camera import intrinsics, project
@@ -124,7 +124,7 @@ def snapshot(boxes: Path) -> Snapshot:
 
 
 def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:
-    places = Attempts(snapshot, decisions).select(Attempts.query(dict(parse_qsl(text))))
+    places = AttemptGallery(snapshot, decisions).select(AttemptGallery.query(dict(parse_qsl(text))))
     return [numbered(snapshot, str(i)) for i in places]
 
 
@@ -177,10 +177,10 @@ def test_decisions_choose_what_is_left(snapshot: Snapshot) -> None:
 
 def test_address_of_a_query_gives_the_query_again() -> None:
     text = "outcome=any&object=a%26b%3Dc&sort=slip&order=up&page=3&hold=stable"
-    query = Attempts.query(dict(parse_qsl(text)))
-    assert Attempts.query(dict(parse_qsl(query.params()))) == query
+    query = AttemptGallery.query(dict(parse_qsl(text)))
+    assert AttemptGallery.query(dict(parse_qsl(query.params()))) == query
     assert query["object"] == "a&b=c" and not query["outcome"]
-    assert Attempts.query().params() == ""
+    assert AttemptGallery.query().params() == ""
 
 
 @pytest.mark.parametrize(
@@ -193,4 +193,4 @@ def test_address_of_a_query_gives_the_query_again() -> None:
 )
 def test_what_cannot_be_asked_for_is_refused(text: str, words: str) -> None:
     with pytest.raises(DataError, match=words):
-        Attempts.query(dict(parse_qsl(text)))
+        AttemptGallery.query(dict(parse_qsl(text)))

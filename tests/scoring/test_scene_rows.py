@@ -19,7 +19,7 @@ from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.scoring.benchmark import rows_digest
 from drakegrasp.scoring.references import REFERENCES, Scene
-from drakegrasp.simulation.attempts import Attempts
+from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 pytestmark = pytest.mark.sim
@@ -86,7 +86,7 @@ def test_every_reference_can_be_made_on_views(path, name):
     rows = open_rows(path, split="test")
     train = open_rows(path, split="train")
     made = REFERENCES[name].make(Scene(data=rows, rows=range(len(rows)), train=train))
-    if isinstance(made, Attempts):
+    if isinstance(made, GraspTable):
         assert len(made) == len(rows) and not made.refused
         return
     assert made.shape == (len(rows), 18)
