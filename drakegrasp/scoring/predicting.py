@@ -1,8 +1,8 @@
 """Predictions: from what a camera saw to grasps, the best first. No network is needed.
 
 Input: an object's visible points in {T}, where the table is z = 0, or the views of scenes. Output:
-`GraspTable`, which `exchange.attempts.write_attempts` writes, a robot executes, a build tries and a
-score judges. `propose` puts palms around the points, the fixed ones of `simulation.palms`, which
+a `GraspTable`, which `exchange.attempts.write_attempts` writes, a robot executes, a build tries and
+a score judges. `propose` puts palms around the points, the fixed ones of `simulation.palms`, which
 the sampler `closing` also tries on whole objects; `predict` orders them (`scoring.ranking`) and
 states a confidence.
 """

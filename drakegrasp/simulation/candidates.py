@@ -92,7 +92,7 @@ Place: TypeAlias = tuple[int, str]
 ARGUMENTS = ("model", "X_TO", "stream", "config")
 #: A palm pose X_OG (4, 4) that is moved along its ray to each stand-off, with drawn spreads; or one
 #: that is tried as it is, with the shape of the hand.
-Palm: TypeAlias = Array | tuple[Array, Shape]
+SampledPalm: TypeAlias = Array | tuple[Array, Shape]
 
 
 class Sampler(Protocol):
@@ -101,7 +101,7 @@ class Sampler(Protocol):
     def __init__(self, model: ObjectModel, X_TO: Array, stream: Stream, config: Config) -> None:
         """Take the object, its resting pose (4, 4), random numbers, and the configuration."""
 
-    def poses(self) -> Iterator[Palm | None]:
+    def poses(self) -> Iterator[SampledPalm | None]:
         """Yield the palms; they do not depend on how many are taken.
 
         None tells that the palms that follow are nearer to each other.
@@ -160,7 +160,7 @@ class Drawing:
             for k, method in dict.fromkeys(places)
         }
         self._model, self._most = model, config.candidates.max
-        self._more, self._turns = _turns(places, palms), list[tuple[Place, Palm]]()
+        self._more, self._turns = _turns(places, palms), list[tuple[Place, SampledPalm]]()
 
     def candidates(self, most: int | None = None) -> Candidates:
         """Return the first palm poses, drawn with the seed, with their palm rays.
@@ -244,7 +244,7 @@ def validate_samplers(config: Config) -> None:
 
 def _palms(
     method: str, resting: int, model: ObjectModel, X_TO: Array, config: Config
-) -> Iterator[Palm | None]:
+) -> Iterator[SampledPalm | None]:
     """Return the palms of a sampler at a resting pose of an object, its index and X_TO (4, 4).
 
     Raises:
@@ -277,8 +277,8 @@ def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
 
 
 def _turns(
-    places: Sequence[Place], palms: Mapping[Place, Iterator[Palm | None]]
-) -> Iterator[tuple[Place, Palm]]:
+    places: Sequence[Place], palms: Mapping[Place, Iterator[SampledPalm | None]]
+) -> Iterator[tuple[Place, SampledPalm]]:
     """Yield a palm of each place in turn, until no sampler yields another one.
 
     A place whose palms become nearer to each other waits until those of all others are as near.

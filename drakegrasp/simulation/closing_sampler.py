@@ -40,7 +40,7 @@ GOOD, BEST, LEAST = (0.9, 0.8, 0.1), 5, 0.4
 NEARER, NEAREST, LAST_ROUNDS = 0.7, 0.1, 10
 #: Least downward component of the approach of palms from above and of slanted ones: the sines of
 #: 60 and 30 degrees.
-ABOVE, SLANTED = float(np.sqrt(0.75)), 0.5
+ABOVE_DOWN, SLANTED_DOWN = float(np.sqrt(0.75)), 0.5
 #: While palms from other sides close well, at most so many palms from above for each of these.
 MOST_ABOVE = 1.5
 #: Number of rounds in a row without a good palm after which a side counts as not free.
@@ -52,7 +52,7 @@ ROUND = {"above": 16, "slanted": 14, "beside": 14, "near": 4, "surface": 6}
 NUMBERS = 7
 #: Ranges of the draws: turns from the axes, tilts and slants from the vertical [degree], places
 #: along the long side and heights, as fractions of half of it and of the object's height.
-YAW, TILT, SLANTS = 20.0, (15.0, 35.0), {"slanted": (30.0, 60.0), "beside": (60.0, 100.0)}
+YAW, TILTS, SLANTS = 20.0, (15.0, 35.0), {"slanted": (30.0, 60.0), "beside": (60.0, 100.0)}
 ALONG, HEIGHTS = 0.6, (0.25, 0.75)
 #: Standard deviations of palms near good ones [m, degree].
 SHIFT, TURN = 0.012, 15.0
@@ -64,7 +64,7 @@ FARTHER, UPWARD = 0.03, 0.17
 UP_GRID, HEIGHT_GRID = 2.0**-10, 2.0**-14
 
 
-class Palm(NamedTuple):
+class ScoredPalm(NamedTuple):
     """A palm pose X_LG (4, 4), the hand's shape, and the score with which it closes."""
 
     X_LG: Array
@@ -75,7 +75,7 @@ class Palm(NamedTuple):
     def side(self) -> int:
         """From where it approaches: 0 from above, 1 slanted, 2 from the side."""
         down = -float(self.X_LG[2, 2])
-        return 0 if down >= ABOVE else 1 if down >= SLANTED else 2
+        return 0 if down >= ABOVE_DOWN else 1 if down >= SLANTED_DOWN else 2
 
 
 class Closing:
@@ -108,8 +108,8 @@ class Closing:
         ]
 
         # The order, the palms of each side that wait for their turn, best first; the best scores.
-        self._order: list[Palm] = []
-        self._waiting: list[list[Palm]] = [[], [], []]
+        self._order: list[ScoredPalm] = []
+        self._waiting: list[list[ScoredPalm]] = [[], [], []]
         self._best = [0.0] * BEST
 
         # What counts as good and as near, and the rounds in a row without a good palm of each side.
@@ -139,7 +139,7 @@ class Closing:
                 self._near, self._vain = max(NEARER * self._near, NEAREST), [0, 0, 0]
                 yield None
 
-    def _next(self) -> Palm | None:
+    def _next(self) -> ScoredPalm | None:
         """Return the next palm, now in the order, or None if more must be drawn first."""
         good = [self._good_of(side) for side in range(3)]
         for side in range(3):
@@ -171,12 +171,12 @@ class Closing:
             waiting[:] = [each for each, is_near in zip(waiting, near, strict=True) if not is_near]
         return palm
 
-    def _cells(self, palms: Sequence[Palm]) -> list[int]:
+    def _cells(self, palms: Sequence[ScoredPalm]) -> list[int]:
         """Return the cell of directions of each palm's approach, in {O}."""
         cells: list[int] = approach_cells(multiply(self._X_OL, _stacked(palms))).tolist()
         return cells
 
-    def _good_of(self, side: int) -> list[Palm]:
+    def _good_of(self, side: int) -> list[ScoredPalm]:
         """Return the good palms of a side that wait, best first."""
         least = max(LEAST, self._good * self._best[0])
         return [palm for palm in self._waiting[side] if palm.score >= least]
@@ -205,9 +205,9 @@ class Closing:
         closer = cosine >= sin_cos_deg(self._near * NEAR_TURN)[1]
         return np.asarray((closer & (shift <= self._near * NEAR_SHIFT)).any(axis=1))
 
-    def _closed(self, drawn: Sequence[tuple[Array, Shape]]) -> list[Palm]:
+    def _closed(self, drawn: Sequence[tuple[Array, Shape]]) -> list[ScoredPalm]:
         """Return palms with their scores."""
-        palms = list[Palm]()
+        palms = list[ScoredPalm]()
         for shape in self._shapes:
             own = [X_LG for X_LG, other in drawn if other == shape]
             if own:
@@ -215,7 +215,7 @@ class Closing:
                 X_OG = centre(self._model, hand, shape.spread, multiply(self._X_OL, np.array(own)))
                 found = close_on(self._solid, hand, shape.spread, X_OG, X_TS=self._X_LO)
                 rows = zip(multiply(self._X_LO, X_OG), found["score"].tolist(), strict=True)
-                palms += [Palm(X_LG, shape, score) for X_LG, score in rows]
+                palms += [ScoredPalm(X_LG, shape, score) for X_LG, score in rows]
         return palms
 
     def _draw(self, sides: Sequence[int]) -> list[tuple[Array, Shape]]:
@@ -250,7 +250,7 @@ class Closing:
             90.0 * int(4.0 * u[0]) + YAW * (2.0 * u[1] - 1.0),
             DEEPER * (2.0 * u[2] - 1.0),
             aside=ALONG * (2.0 * u[3] - 1.0),
-            tilt=TILT[0] + u[4] * (TILT[1] - TILT[0]),
+            tilt=TILTS[0] + u[4] * (TILTS[1] - TILTS[0]),
             towards=360.0 * u[5],
         )
         return X_LG, shape
@@ -269,7 +269,7 @@ class Closing:
         return make_pose(R, self._points[i] - (least + FARTHER * u[2]) * z)
 
 
-def _stacked(palms: Sequence[Palm]) -> Array:
+def _stacked(palms: Sequence[ScoredPalm]) -> Array:
     return np.reshape([palm.X_LG for palm in palms], (-1, 4, 4))
 
 

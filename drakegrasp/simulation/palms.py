@@ -29,7 +29,7 @@ TILT, TILTED = 25.0, (0.0, 90.0, 180.0, 270.0)
 ASIDE = (-0.4, 0.4)
 #: Angle of slanted palms from the vertical, and the directions from which they come, measured from
 #: the long side [degree].
-SLANTED, SLANTED_FROM = 55.0, (0.0, 90.0, 180.0, 270.0)
+SLANT, SLANTED_FROM = 55.0, (0.0, 90.0, 180.0, 270.0)
 #: Directions from which horizontal palms come, measured from the long side [degree].
 BESIDE = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
 #: Palms from the side aim at half the object's height, or if the table is in the way, at most at
@@ -49,7 +49,7 @@ class Shape(NamedTuple):
     spread: float
 
 
-class Palm(NamedTuple):
+class FixedPalm(NamedTuple):
     """A palm pose X_TG (4, 4), the spread [rad] with which the hand closes, and its origin."""
 
     X_TG: Array
@@ -88,7 +88,7 @@ class Palms:
         down = reach(hand, np.array([0.0, 0.0, 1.0])) + TABLE_GAP - self._top
         self._standoff = max(self._least, down)
 
-    def fixed(self) -> list[Palm]:
+    def fixed(self) -> list[FixedPalm]:
         """Return 30 to 70 palms, the simplest first.
 
         No two palms of one spread are within `SAME`.
@@ -149,41 +149,41 @@ class Palms:
             return None
         return make_pose(R, origin + np.array([0.0, 0.0, raised]))
 
-    def _from_above(self) -> Iterator[Palm]:
+    def _from_above(self) -> Iterator[FixedPalm]:
         """Yield the fixed palms that look down on the object."""
         deepest, (spread, *wider) = -min(DEEPER, self._standoff - self._least), self.spreads
         for turn in TURNS:
             for higher in (0.0, DEEPER, deepest):
-                yield Palm(self.above(turn, higher), spread, "from above")
+                yield FixedPalm(self.above(turn, higher), spread, "from above")
         for turn in DIAGONAL:
-            yield Palm(self.above(turn), spread, "from above")
+            yield FixedPalm(self.above(turn), spread, "from above")
         for turn in TURNS[:2]:
             for aside in ASIDE:
                 said = "from above, beside the middle"
-                yield Palm(self.above(turn, aside=aside), spread, said)
+                yield FixedPalm(self.above(turn, aside=aside), spread, said)
         for towards in TILTED:
             for turn in TURNS[:2]:
                 for higher in (0.0, DEEPER):
                     X_TG = self.above(turn, higher, tilt=TILT, towards=towards)
-                    yield Palm(X_TG, spread, "from above, tilted")
+                    yield FixedPalm(X_TG, spread, "from above, tilted")
         for other in wider:
             for turn in TURNS:
                 for higher in (0.0, DEEPER):
-                    yield Palm(self.above(turn, higher), other, "from above, spread")
+                    yield FixedPalm(self.above(turn, higher), other, "from above, spread")
 
-    def _from_the_side(self) -> Iterator[Palm]:
+    def _from_the_side(self) -> Iterator[FixedPalm]:
         """Yield the fixed palms that come from the side, and close across the vertical."""
-        palms = [(SLANTED, each, "slanted") for each in SLANTED_FROM]
+        palms = [(SLANT, each, "slanted") for each in SLANTED_FROM]
         palms += [(90.0, each, "from the side") for each in BESIDE]
         for slant, where, said in palms:
             for turn in (0.0, 180.0):
                 if (X_TG := self.beside(slant, where, turn)) is not None:
-                    yield Palm(X_TG, self.spreads[0], said)
+                    yield FixedPalm(X_TG, self.spreads[0], said)
 
 
-def distinct(palms: list[Palm]) -> list[Palm]:
+def distinct(palms: list[FixedPalm]) -> list[FixedPalm]:
     """Return the palms that are not within `SAME` of an earlier one with the same spread."""
-    kept: list[Palm] = []
+    kept: list[FixedPalm] = []
     for palm in palms:
         X, known = palm.X_TG, [k.X_TG for k in kept if k.spread == palm.spread]
         poses = np.reshape(known, (-1, 4, 4))
