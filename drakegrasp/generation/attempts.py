@@ -1,9 +1,9 @@
 """The trial setup of an object in this process, the steps of a trial, and the rows of a shard.
 
-Input: a prepared object of a dataset, and attempts. Output: the predictions from geometry, the
-records of the trials, and the columns of a shard by the names of `drakegrasp.dataset.schema`:
-`/trials`, with a row per attempt, and `/looks`, with the images of each success. Nothing is written
-here. For a verdict, the filters of a dataset are applied to the columns of a single trial.
+Input: a prepared object of a dataset, and attempts. Output: what geometry decides, the records of
+the trials, and the columns of a shard by the names of `drakegrasp.dataset.schema`: `/trials`, with
+a row per attempt, and `/looks`, with the images of each success. Nothing is written here. For a
+verdict, the filters of a dataset are applied to the columns of a single trial.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from drakegrasp.simulation.attempts import posture_attempts
 from drakegrasp.simulation.candidates import palm_attempts
 from drakegrasp.simulation.scene import Scene, hand_joint_names
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
-from drakegrasp.simulation.screen import Prediction, centred, predict
+from drakegrasp.simulation.screen import Screening, centred, screen
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.table import AnyArray, Table
 from drakegrasp.vision.camera import (
@@ -153,31 +153,31 @@ def find_attempt(
     return list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
 
 
-def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
-    """Return the prediction from geometry for each attempt; one call for all is much faster."""
+def screen_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Screening | None]:
+    """Return what geometry decides about each attempt; one call for all is much faster."""
     config, prepared = setup.config, setup.prepared
     hand = load_hand(config.hand_source)
 
-    # `predict` takes attempts of one preshape.
+    # `screen` takes attempts of one preshape.
     groups: dict[int | None, list[int]] = {}
     for row, attempt in enumerate(attempts):
         groups.setdefault(attempt.preshape, []).append(row)
-    found: list[Prediction | None] = [None] * len(attempts)
+    found: list[Screening | None] = [None] * len(attempts)
     for preshape, rows in groups.items():
         own = [attempts[row] for row in rows]
         X_TO = prepared.resting_poses[[attempt.resting for attempt in own]]
-        said = predict(prepared.model, hand.at(preshape), X_TO, own, config.screen)
-        for row, prediction in zip(rows, said, strict=True):
-            found[row] = prediction
+        said = screen(prepared.model, hand.at(preshape), X_TO, own, config.screen)
+        for row, screening in zip(rows, said, strict=True):
+            found[row] = screening
     return found
 
 
 def try_attempt(
-    setup: TrialSetup, attempt: Attempt, prediction: Prediction | None = None
+    setup: TrialSetup, attempt: Attempt, screening: Screening | None = None
 ) -> TrialRecord:
     """Run the trial of one attempt; replace the scene if Drake failed in it."""
     X_TO = setup.prepared.resting_poses[attempt.resting]
-    record = run_attempt(setup.scene_of(attempt), X_TO, attempt, setup.config, prediction)
+    record = run_attempt(setup.scene_of(attempt), X_TO, attempt, setup.config, screening)
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
         setup.renew_scene()

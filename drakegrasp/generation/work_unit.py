@@ -31,7 +31,7 @@ from drakegrasp.generation.attempts import (
     judge_sample,
     list_attempts,
     look_at,
-    predict_attempts,
+    screen_attempts,
     trial_rows,
     trial_setup,
     try_attempt,
@@ -43,7 +43,7 @@ from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import ATTEMPT, Journal, Verdict, inject_fault, open_journal
 from drakegrasp.simulation.attempt import Attempt, is_drawn
 from drakegrasp.simulation.scene_cache import repeat_disturbed
-from drakegrasp.simulation.screen import Prediction
+from drakegrasp.simulation.screen import Screening
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.table import AnyArray, Table
 
@@ -58,7 +58,7 @@ REPEAT_FILTERS = FilterConfig(outlier_sigma=0.0)
 #: Descriptions of the steps that are not attempts, for error messages.
 _STEPS = {
     "build": "building its scene",
-    "predict": "predicting its attempts",
+    "screen": "screening its attempts",
     "look": "rendering its images",
     "measure": "measuring its contacts",
     "write": "writing its shard",
@@ -219,19 +219,19 @@ class _Experiment:
         """
         attempts = self._attempts
         # The first call computes the object's distance field.
-        with self._step("predict"):
-            inject_fault(self._unit.header.object_name, "predict")
-            predictions = predict_attempts(self._setup, attempts)
+        with self._step("screen"):
+            inject_fault(self._unit.header.object_name, "screen")
+            screenings = screen_attempts(self._setup, attempts)
         steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
         unresolved = set(self._journal.unresolved)
         records = dict[int, TrialRecord]()
         for row in sorted(range(len(steps)), key=lambda row: steps[row] not in unresolved):
-            records[row] = self._try(attempts[row], predictions[row], steps[row])
+            records[row] = self._try(attempts[row], screenings[row], steps[row])
         ordered = [records[row] for row in range(len(attempts))]
         self._errors.update(record.message for record in ordered if record.message)
         return ordered
 
-    def _try(self, attempt: Attempt, prediction: Prediction | None, step: str) -> TrialRecord:
+    def _try(self, attempt: Attempt, screening: Screening | None, step: str) -> TrialRecord:
         verdict = self._journal.verdict(step)
         if verdict is not None:
             outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
@@ -240,7 +240,7 @@ class _Experiment:
         with self._journal.step(step, HANG_FACTOR * self._config.attempt_seconds):
             name = self._unit.header.object_name
             inject_fault(name, attempt.candidate, attempt.standoff_index)
-            return try_attempt(self._setup, attempt, prediction)
+            return try_attempt(self._setup, attempt, screening)
 
     def _looks(self, records: Sequence[TrialRecord]) -> Table:
         """Return the rows of `/looks`, with the images of both cameras of every success."""

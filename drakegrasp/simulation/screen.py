@@ -1,6 +1,6 @@
 """Stage "screen": what geometry decides about attempts before anything is simulated.
 
-Input: attempts at an object on the table. Output: a `Prediction` for each. Points on the hand's
+Input: attempts at an object on the table. Output: a `Screening` for each. Points on the hand's
 surface are looked up in the object's distance field: with the hand open at the start pose, and
 while each finger closes by itself. While the hand closes, object and wrist are static and each
 finger has one degree of freedom. Geometry therefore decides which link meets the object first, and
@@ -8,7 +8,7 @@ where. Its errors come from the compliance of the contact, the spacing of the gr
 of the points. The margins of `ScreenConfig` cover these errors.
 
 An attempt counts as lost only if it is lost by more than the margin. Every step treats each point
-separately, so a prediction depends on its attempt alone, and not on the other attempts in the call.
+separately, so a screening depends on its attempt alone, and not on the other attempts in the call.
 
 `centred` applies to hands in which opposed fingers share a motor. It moves the palm along the
 closing direction so that both sides meet the object at the same time. If one finger meets the
@@ -51,7 +51,7 @@ FINGER_GAP = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Prediction:
+class Screening:
     """What geometry decides about one attempt of a hand with k fingers.
 
     Attributes:
@@ -69,13 +69,13 @@ class Prediction:
     last: Array
 
 
-def predict(
+def screen(
     model: ObjectModel,
     hand: Hand,
     X_TO: npt.ArrayLike,
     attempts: Sequence[Attempt],
     config: ScreenConfig,
-) -> list[Prediction | None]:
+) -> list[Screening | None]:
     """Return what geometry decides about attempts; None for an attempt that is not screened.
 
     Attempts are not screened if their palm ray misses, their fingers start closed, `finger_sweep`
@@ -89,9 +89,9 @@ def predict(
         attempts: Attempts at the object, n.
         config: The margins.
     """
-    predictions: list[Prediction | None] = [None] * len(attempts)
+    screenings: list[Screening | None] = [None] * len(attempts)
     if config.mode == "off":
-        return predictions
+        return screenings
 
     # The paths of the fingers depend on the spread: screen attempts with one spread together.
     rows_by_spread: dict[float, list[int]] = {}
@@ -105,12 +105,12 @@ def predict(
             continue
         X_OG = np.stack([attempts[row].X_OG for row in rows])
         lookup = PointLookup(model.field, each_X_TO[rows], X_OG)
-        screened = _screen(lookup, paths, _widened(config, model.field))
+        screened = _screen_spread(lookup, paths, _widened(config, model.field))
         for row, found in zip(rows, screened, strict=True):
             # Fingers that share a motor start together.
             starts = open_together(hand, found.closing) if found.outcome is None else found.closing
-            predictions[row] = replace(found, closing=starts)
-    return predictions
+            screenings[row] = replace(found, closing=starts)
+    return screenings
 
 
 def extra_margin(field: DistanceField) -> float:
@@ -176,8 +176,8 @@ def _affine(row: Points, p: Points) -> Points:
     return np.asarray(values)
 
 
-def _screen(lookup: PointLookup, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
-    """Return the predictions for attempts with one spread."""
+def _screen_spread(lookup: PointLookup, paths: HandPaths, config: ScreenConfig) -> list[Screening]:
+    """Return the screenings of attempts with one spread."""
     # Drop attempts whose open hand is certainly in collision. A subset of the points suffices to
     # reject an attempt, because the minimum over all points can only be smaller.
     margin = config.start_margin
@@ -186,23 +186,23 @@ def _screen(lookup: PointLookup, paths: HandPaths, config: ScreenConfig) -> list
     alive = np.flatnonzero(distance >= -margin)
     distance[alive] = _open_distance(lookup, alive, opened, margin)
     alive = alive[distance[alive] >= -margin]
-    collision = Prediction(
+    collision = Screening(
         outcome=Outcome.START_COLLISION, clear=False, closing=_NO_ANGLES, last=_NO_ANGLES
     )
-    predictions = [collision] * len(lookup)
+    screenings = [collision] * len(lookup)
 
     # Close the fingers of the remaining attempts.
     for rows in _chunks(alive, SWEEP_CHUNK):
         angles = _closing_angles(lookup, paths, rows, config)
         for row in rows.tolist():
             closing, last = angles.get(row, (_NO_ANGLES, _NO_ANGLES))
-            predictions[row] = Prediction(
+            screenings[row] = Screening(
                 outcome=None if row in angles else Outcome.SCREENED,
                 clear=bool(distance[row] > margin),
                 closing=closing,
                 last=last,
             )
-    return predictions
+    return screenings
 
 
 _NO_ANGLES = np.zeros(0)
@@ -211,7 +211,7 @@ _NO_ANGLES = np.zeros(0)
 def _closing_angles(
     lookup: PointLookup, paths: HandPaths, rows: Counts, config: ScreenConfig
 ) -> dict[int, tuple[Array, Array]]:
-    """Return `closing` and `last` of a `Prediction` for attempts with all fingertips in reach."""
+    """Return `closing` and `last` of a `Screening` for attempts with all fingertips in reach."""
     # One required finger that does not arrive decides, so the next finger skips these attempts.
     sweeps = []
     for path in paths.fingers:

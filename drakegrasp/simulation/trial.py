@@ -42,7 +42,7 @@ from drakegrasp.simulation.scene import (
     reset_attempt,
     start_limits,
 )
-from drakegrasp.simulation.screen import Prediction, predict
+from drakegrasp.simulation.screen import Screening, screen
 
 #: Far below a time step, and far above the rounding error of a sum of time steps [s].
 ROUNDING = 1e-9
@@ -156,7 +156,7 @@ def run_attempt(
     X_TO: npt.ArrayLike,
     attempt: Attempt,
     config: Config,
-    prediction: Prediction | None = None,
+    screening: Screening | None = None,
 ) -> TrialRecord:
     """Simulate one attempt to grasp and lift the object, and return its record.
 
@@ -167,7 +167,7 @@ def run_attempt(
         X_TO: Resting pose of the object in the table-top frame, (4, 4).
         attempt: The attempt.
         config: The rules.
-        prediction: Result of `predict` for the attempt, if the caller already has it; the record is
+        screening: Result of `screen` for the attempt, if the caller already has it; the record is
             the same without it.
 
     Raises:
@@ -180,13 +180,13 @@ def run_attempt(
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG)
     try:
-        if prediction is None:
-            (prediction,) = predict(scene.model, scene.hand, X_TO, [attempt], config.screen)
-        decided = _start(scene, X_TO, attempt, prediction)
+        if screening is None:
+            (screening,) = screen(scene.model, scene.hand, X_TO, [attempt], config.screen)
+        decided = _start(scene, X_TO, attempt, screening)
         if decided is not None:
             return replace(start, outcome=decided)
         limits = start_limits(config)
-        record = _close(scene, start, attempt, config, limits, prediction)
+        record = _close(scene, start, attempt, config, limits, screening)
         if record.outcome is not Outcome.SUCCESS:
             return record
         return _lift(scene, record, config, limits, _materials(scene, attempt))
@@ -227,7 +227,7 @@ def _place(scene: Scene, X_TO: Array, attempt: Attempt, closing: Array | None) -
 
 
 def _start(
-    scene: Scene, X_TO: Array, attempt: Attempt, prediction: Prediction | None
+    scene: Scene, X_TO: Array, attempt: Attempt, screening: Screening | None
 ) -> Outcome | None:
     """Place the open hand, and return the outcome of an attempt that its start decides."""
     # Do not simulate an attempt that geometry alone decides.
@@ -235,10 +235,10 @@ def _start(
         return Outcome.RAY_MISS
     if multiply(X_TO, attempt.X_OG)[2, 3] <= 0.0:
         return Outcome.BELOW_TABLE
-    screened = None if prediction is None else prediction.outcome
+    screened = None if screening is None else screening.outcome
     if screened is Outcome.START_COLLISION:
         return screened
-    if prediction is not None and screened is not None and prediction.clear:
+    if screening is not None and screened is not None and screening.clear:
         return screened
 
     # If the open hand is close to a collision, Drake decides whether it collides.
@@ -260,19 +260,19 @@ def _close(
     attempt: Attempt,
     config: Config,
     limits: TrialLimits,
-    prediction: Prediction | None,
+    screening: Screening | None,
 ) -> TrialRecord:
     """Close the hand on the static object, and return the record; a success may lift."""
     # Start just before the fingers meet something, if geometry has found where.
     clearance = ClearanceMonitor(config.close)
     clearance.look(scene)
-    if prediction is not None:
-        _place(scene, start.X_TO, attempt, prediction.closing)
+    if screening is not None:
+        _place(scene, start.X_TO, attempt, screening.closing)
         clearance.look(scene)
     if attempt.path is not None and attempt.own_motors:
         _follow_path(scene, limits, config.close, attempt.path, clearance)
     else:
-        _close_fingers(scene, limits, config.close, prediction, clearance)
+        _close_fingers(scene, limits, config.close, screening, clearance)
     closed = Closed(
         contacts=read_contacts(scene),
         q=hand_positions(scene),
@@ -313,16 +313,16 @@ def _close_fingers(
     scene: Scene,
     limits: TrialLimits,
     rules: CloseConfig,
-    prediction: Prediction | None,
+    screening: Screening | None,
     clearance: ClearanceMonitor,
 ) -> None:
     """Close the fingers on the static object until they stop or a required finger has missed it."""
     # Closing that geometry skipped counts as time; an angle beyond the last contact is a miss.
     end, last, hand = rules.max_time, np.array(np.inf), scene.hand
-    if prediction is not None:
-        end -= float((prediction.closing / hand.closing_speed).min())
+    if screening is not None:
+        end -= float((screening.closing / hand.closing_speed).min())
         # A fingertip that is not required does not end the attempt if it misses the object.
-        last = np.where(hand.required, prediction.last + BEYOND * hand.closing_unit, np.inf)
+        last = np.where(hand.required, screening.last + BEYOND * hand.closing_unit, np.inf)
 
     for _ in _checks(scene, limits, rules, end, clearance):
         stopped = finger_speed(scene) < rules.stop_speed

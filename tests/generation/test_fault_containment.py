@@ -191,7 +191,7 @@ def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     assert not read_manifest(out).refused
 
 
-@pytest.mark.parametrize("step", ["build", "predict", "measure", "write"])
+@pytest.mark.parametrize("step", ["build", "screen", "measure", "write"])
 def test_every_step_of_a_unit_is_in_its_journal(
     undisturbed: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,6 @@ def test_screen_that_hangs_ends_and_is_named(
     header.path(out).unlink()
     unit = WorkUnit(out=out, header=header, config=manifest.config, restartable=True)
     # Building the scene has the same limit, and takes a second of computing.
-    die_of_hanging(run_unit, unit, "spin:1_box_a:predict", seconds=2.0)
-    with pytest.raises(MachineError, match=r"predicting its attempts passed its time limit"):
+    die_of_hanging(run_unit, unit, "spin:1_box_a:screen", seconds=2.0)
+    with pytest.raises(MachineError, match=r"screening its attempts passed its time limit"):
         run_unit(unit)

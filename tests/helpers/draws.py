@@ -41,12 +41,12 @@ from drakegrasp.simulation.candidates import (
     palm_attempts,
     rotation_candidates,
 )
-from drakegrasp.simulation.screen import predict
+from drakegrasp.simulation.screen import screen
 from drakegrasp.vision.camera import DepthSensor, spoil_depth
 
 #: Of the real meshes: a thin one, one with many faces, one that lies on its side.
 REAL = ("24_mug_final", "42_wineglass_final", "110_bunny_final")
-#: Attempts whose predictions by geometry are hashed.
+#: Attempts whose screenings are hashed.
 PREDICTED = 600
 #: Palm poses of the sampler `closing` that are hashed.
 CLOSING = 60
@@ -109,12 +109,12 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     X_TO = make_pose(R_TO, [0.1, 0.2, model.half_extents[2]])
     closing = Drawing(model, X_TO, load_config("fast")).candidates(CLOSING)
     yield "closing", digest(closing.X_OG, closing.spread)
-    predictions = predict(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
+    screenings = screen(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
     yield (
         "predictions",
         digest(
-            np.array([-1 if p is None or p.outcome is None else p.outcome for p in predictions]),
-            *[p.closing for p in predictions if p is not None],
+            np.array([-1 if p is None or p.outcome is None else p.outcome for p in screenings]),
+            *[p.closing for p in screenings if p is not None],
         ),
     )
 

@@ -1,7 +1,7 @@
 """Faults that tests cause in a process that prepares an object or runs a work unit.
 
 A fault is `KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt, `KIND:OBJECT` for preparing an object,
-`KIND:OBJECT:distances` for its distance field, `KIND:OBJECT:predict` for the screen; several faults
+`KIND:OBJECT:distances` for its distance field, `KIND:OBJECT:screen` for the screen; several faults
 are separated by blanks.
 """
 

@@ -26,17 +26,17 @@ from drakegrasp.hand.finger_sweep import hand_paths
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation import screen
+from drakegrasp.simulation import screen as stage
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.screen import Prediction, predict
+from drakegrasp.simulation.screen import Screening, screen
 from drakegrasp.simulation.trial import run_attempt
 
 OFF = load_config(overrides=["screen.mode=off"])
 
 
-def ask(cube: ObjectModel, hand: Hand, attempt, **margins: float) -> Prediction | None:
-    (found,) = predict(cube, hand, standing(cube), [attempt], ScreenConfig(**margins))
+def ask(cube: ObjectModel, hand: Hand, attempt, **margins: float) -> Screening | None:
+    (found,) = screen(cube, hand, standing(cube), [attempt], ScreenConfig(**margins))
     return found
 
 
@@ -90,7 +90,7 @@ def test_it_is_not_asked_where_it_has_nothing_to_say(cube, hand):
     assert ask(cube, hand, closed) is None
 
 
-def test_prediction_depends_on_the_attempt_alone(cube, hand, config):
+def test_screening_depends_on_the_attempt_alone(cube, hand, config):
     """The poses of the object differ, and the higher one blocks no finger at the table."""
     drawn, made, together = drawn_attempts(cube, standing(cube), config), [], []
     lifted = make_pose(np.eye(3), [0.0, 0.0, 0.02]) @ standing(cube)
@@ -98,9 +98,9 @@ def test_prediction_depends_on_the_attempt_alone(cube, hand, config):
         assert len(made) < 2000, "three of the attempts must be simulated"
         made += islice(drawn, 100)
         X_TO = np.array([(standing(cube), lifted)[row % 2] for row in range(len(made))])
-        together = predict(cube, hand, X_TO, made, config.screen)
+        together = screen(cube, hand, X_TO, made, config.screen)
     for row, attempt in enumerate(made):
-        (alone,) = predict(cube, hand, X_TO[row], [attempt], config.screen)
+        (alone,) = screen(cube, hand, X_TO[row], [attempt], config.screen)
         found = together[row]
         assert (alone is None) == (found is None)
         if found is not None:
@@ -119,7 +119,7 @@ def test_nothing_that_is_screened_would_have_been_lifted(tmp_path, hand, config)
     # Take attempts from the draw until ten of either kind are lost.
     losers: dict[Outcome, list[Attempt]] = {Outcome.START_COLLISION: [], Outcome.SCREENED: []}
     for attempt in drawn_attempts(model, X_TO, override_config(config, ["seed=1"])):
-        (found,) = predict(model, hand, X_TO, [attempt], config.screen)
+        (found,) = screen(model, hand, X_TO, [attempt], config.screen)
         above = (X_TO @ attempt.X_OG)[2, 3] > 0.0
         if above and found is not None and found.outcome is not None:
             losers[found.outcome].append(attempt)
@@ -147,7 +147,7 @@ def test_wall_between_the_points_of_a_coarse_grid_is_met(tmp_path, hand):
         wall = length / 2.0 - 0.001
         attempt = from_above(model, STANDOFF)
         attempt.X_OG[:3, 3] += [0.0, wall, 0.0]
-        (found,) = predict(model, hand, standing(model), [attempt], ScreenConfig())
+        (found,) = screen(model, hand, standing(model), [attempt], ScreenConfig())
         assert found.outcome is None
         tips = [tip_distance(hand, i, q, attempt, wall) for i, q in enumerate(found.closing)]
         assert min(tips) > 0.0
@@ -164,9 +164,9 @@ def tip_distance(hand: Hand, finger: int, angle: float, attempt, wall: float) ->
 # The sweep and the margins, against brute force
 
 
-def lookup_of(model: ObjectModel, attempts: list[Attempt]) -> screen.PointLookup:
+def lookup_of(model: ObjectModel, attempts: list[Attempt]) -> stage.PointLookup:
     X_OG = np.stack([attempt.X_OG for attempt in attempts])
-    return screen.PointLookup(model.field, standing(model), X_OG)
+    return stage.PointLookup(model.field, standing(model), X_OG)
 
 
 def brute_sweep(lookup, path, row: int, config: ScreenConfig) -> tuple[int, bool, int]:
@@ -202,7 +202,7 @@ def test_sweep_finds_what_a_look_at_every_angle_finds(cube, hand, config):
     lookup, rows = lookup_of(cube, attempts), np.arange(len(attempts))
     kinds = set()
     for path in hand_paths(hand, 0.0).fingers:
-        sweep = screen._sweep_finger(lookup, path, rows, config)
+        sweep = stage._sweep_finger(lookup, path, rows, config)
         for row in rows:
             start, arrives, last = brute_sweep(lookup, path, row, config)
             assert sweep.start[row] == start
@@ -271,12 +271,12 @@ def test_open_hand_near_the_object_is_not_clear(cube, hand, margins, clear):
 
 @pytest.mark.parametrize("name", ["start_margin", "reach_margin", "block_margin", "clearance"])
 def test_coarse_grid_widens_each_margin(cube, name):
-    margins, blur = ScreenConfig(), screen.COVERED + 0.004
+    margins, blur = ScreenConfig(), stage.COVERED + 0.004
     coarse = SimpleNamespace(blur=blur)
-    assert screen.extra_margin(coarse) == pytest.approx(0.004)
-    wide = screen._widened(margins, coarse)
+    assert stage.extra_margin(coarse) == pytest.approx(0.004)
+    wide = stage._widened(margins, coarse)
     assert getattr(wide, name) == pytest.approx(getattr(margins, name) + 0.004)
-    assert screen.extra_margin(SimpleNamespace(blur=0.5 * screen.COVERED)) == 0.0
+    assert stage.extra_margin(SimpleNamespace(blur=0.5 * stage.COVERED)) == 0.0
 
 
 def test_one_finger_that_is_not_required_screens_nothing(cube, hand):

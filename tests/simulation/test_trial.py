@@ -41,7 +41,7 @@ from drakegrasp.simulation.scene import (
     reset_attempt,
     reset_object,
 )
-from drakegrasp.simulation.screen import Prediction
+from drakegrasp.simulation.screen import Screening
 from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 
 pytestmark = pytest.mark.sim
@@ -350,8 +350,8 @@ def test_slip_and_turn_are_how_the_object_lags_behind_the_palm(cube, config, han
     assert np.allclose((record.lift.X_TO @ record.lift.X_OG)[:3, 3], config.lift.p_TG, atol=1e-4)
 
 
-def prediction(outcome: Outcome | None, *, clear: bool, last: float = 2.0) -> Prediction:
-    return Prediction(outcome=outcome, clear=clear, closing=np.zeros(3), last=np.full(3, last))
+def screening(outcome: Outcome | None, *, clear: bool, last: float = 2.0) -> Screening:
+    return Screening(outcome=outcome, clear=clear, closing=np.zeros(3), last=np.full(3, last))
 
 
 @pytest.mark.parametrize(
@@ -368,10 +368,10 @@ def prediction(outcome: Outcome | None, *, clear: bool, last: float = 2.0) -> Pr
         (STANDOFF, None, True, Outcome.TIMEOUT),
     ],
 )
-def test_prediction_decides_where_it_is_certain(scene, cube, standoff, said, clear, outcome):
+def test_screening_decides_where_it_is_certain(scene, cube, standoff, said, clear, outcome):
     """What is simulated times out at once."""
     hurried = load_config(overrides=["attempt_seconds=1e-6"])
-    known = prediction(said, clear=clear)
+    known = screening(said, clear=clear)
     record = run_attempt(scene, standing(cube), from_above(cube, standoff), hurried, known)
     assert record.outcome is outcome
 
@@ -379,7 +379,7 @@ def test_prediction_decides_where_it_is_certain(scene, cube, standoff, said, cle
 def test_closing_ends_where_a_fingertip_has_passed_the_object(scene, cube, config, hand):
     """In the air: at the first look two degrees beyond the last angle at which it could touch."""
     last = 0.4
-    known = prediction(None, clear=True, last=last)
+    known = screening(None, clear=True, last=last)
     record = run_attempt(scene, standing(cube), from_above(cube, 0.3), config, known)
     assert record.outcome is Outcome.MISSING_FINGERTIP
     end = last + np.deg2rad(2.0)
@@ -392,7 +392,7 @@ def test_time_of_closing_that_was_skipped_counts(scene, cube, config, hand):
     """A finger that starts half closed has as much less time for the rest."""
     short = override_config(config, ["close.max_time=0.5", "close.stop_speed=1e-9"])
     for start, rest in ((0.0, 0.5), (0.2, 0.5 - 0.2 / min(hand.closing_speed))):
-        known = replace(prediction(None, clear=True), closing=np.full(3, start))
+        known = replace(screening(None, clear=True), closing=np.full(3, start))
         record = run_attempt(scene, standing(cube), from_above(cube, 0.3), short, known)
         step = config.physics.time_step
         assert record.closed.duration == pytest.approx(rest, abs=step)
@@ -404,7 +404,7 @@ def test_closing_ends_at_the_first_look_at_which_the_fingers_stand(
 ):
     """In the air they close at about 1 rad/s until time is up."""
     patient = override_config(config, [f"close.stop_speed={speed}", "close.max_time=0.5"])
-    known = prediction(None, clear=True)
+    known = screening(None, clear=True)
     record = run_attempt(scene, standing(cube), from_above(cube, 0.3), patient, known)
     assert record.closed.duration == pytest.approx(looks * config.close.check_period, abs=8e-3)
 
