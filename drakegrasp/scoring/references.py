@@ -42,7 +42,7 @@ FINGER_SPACING = 0.04
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class ReferenceInput:
     """The rows to score, the training rows, and the seed of the draws.
 
     Attributes:
@@ -88,28 +88,28 @@ class Scene:
         return unproject(self.data.K, np.column_stack([u, v]), image[3][v, u])
 
 
-def own(scene: Scene) -> Array:
+def own(inputs: ReferenceInput) -> Array:
     """Return the stored grasps of the rows: the upper bound."""
-    return np.asarray(scene.data.column("grasps")[list(scene.rows)], dtype=float)
+    return np.asarray(inputs.data.column("grasps")[list(inputs.rows)], dtype=float)
 
 
-def nearest_image(scene: Scene) -> Array:
+def nearest_image(inputs: ReferenceInput) -> Array:
     """Return the grasp of the training image with the closest descriptor.
 
     The descriptor has two values for each cell of a grid of 16 by 16: the mean depth [m], cut at
     the far plane, and 0.1 times the fraction of object pixels. The distance is Euclidean.
     """
-    count = len(scene.train)
+    count = len(inputs.train)
     known = np.arange(count)
     if count > MOST_IMAGES:
-        drawn = Stream(scene.seed, object_key("nearest image")).permutation(count)
+        drawn = Stream(inputs.seed, object_key("nearest image")).permutation(count)
         known = np.sort(drawn[:MOST_IMAGES])
-    table = np.array([_descriptor(scene.train, int(row)) for row in known])
+    table = np.array([_descriptor(inputs.train, int(row)) for row in known])
     nearest = []
-    for row in scene.rows:
-        distance = ((table - _descriptor(scene.data, row)) ** 2).sum(axis=1)
+    for row in inputs.rows:
+        distance = ((table - _descriptor(inputs.data, row)) ** 2).sum(axis=1)
         nearest.append(known[np.argmin(distance)])
-    return scene.train_grasps[nearest]
+    return inputs.train_grasps[nearest]
 
 
 def _descriptor(data: GraspDataset, row: int) -> Array:
@@ -129,36 +129,36 @@ def _descriptor(data: GraspDataset, row: int) -> Array:
     return np.concatenate(cells)
 
 
-def constant(scene: Scene) -> Array:
+def constant(inputs: ReferenceInput) -> Array:
     """Return one grasp for all rows: the training grasp closest to the mean, in the camera's frame.
 
     A normal of length 1 is treated as equal to 50 mm in the distance.
     """
-    return np.tile(scene.constant, (len(scene.rows), 1))
+    return np.tile(inputs.constant, (len(inputs.rows), 1))
 
 
-def random_train(scene: Scene) -> Array:
+def random_train(inputs: ReferenceInput) -> Array:
     """Return a training grasp for each row, drawn at random, in the camera's frame."""
-    count = len(scene.train)
-    drawn = [int(scene.stream("random", row).integers(count, 1)[0]) for row in scene.rows]
-    return scene.train_grasps[drawn]
+    count = len(inputs.train)
+    drawn = [int(inputs.stream("random", row).integers(count, 1)[0]) for row in inputs.rows]
+    return inputs.train_grasps[drawn]
 
 
-def top_down(scene: Scene) -> Array:
+def top_down(inputs: ReferenceInput) -> Array:
     """Return a grasp from above at the visible centroid, which closes across the minor axis.
 
     The axes are principal axes of the visible points, seen from above. The finger that opposes the
     others in most training grasps is on one side, and the other fingers on the other side. They are
     30 mm below the highest visible point, or half-way down if that is higher.
     """
-    poses = scene.data.column(f"object_props/frame_work2cam_{scene.data.camera}")
-    return np.array([_from_above(scene, row, unpack_pose(poses[row])) for row in scene.rows])
+    poses = inputs.data.column(f"object_props/frame_work2cam_{inputs.data.camera}")
+    return np.array([_from_above(inputs, row, unpack_pose(poses[row])) for row in inputs.rows])
 
 
-def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
+def _from_above(inputs: ReferenceInput, row: int, X_TC: Array) -> Array:
     """Return the grasp (6k,) of `top_down` for a row, with the pose of its camera."""
     # Visible points seen from above, and their axes.
-    p_TQ = transform_points(X_TC, scene.visible(row))
+    p_TQ = transform_points(X_TC, inputs.visible(row))
     centroid = p_TQ[:, :2].mean(axis=0)
     centred = p_TQ[:, :2] - centroid
     major, minor = np.linalg.svd(centred.T @ centred)[0].T
@@ -167,10 +167,10 @@ def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     height = max(top - DEPTH_OF_GRASP, top / 2.0)
 
     # The thumb is on one side, the other fingers are side by side on the other.
-    fingers, others = scene.data.column("grasps").shape[1] // 6, 0
+    fingers, others = inputs.data.column("grasps").shape[1] // 6, 0
     points, normals = np.zeros((fingers, 3)), np.zeros((fingers, 3))
     for finger in range(fingers):
-        if finger == scene.thumb:
+        if finger == inputs.thumb:
             side, reach, along = 1.0, high, 0.0
         else:
             side, reach = -1.0, low
@@ -182,21 +182,21 @@ def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
     return pack_grasp(transform_points(X_CT, points), rotate_vectors(X_CT, normals))
 
 
-def closing(scene: Scene) -> GraspTable:
+def closing(inputs: ReferenceInput) -> GraspTable:
     """Return for each row the grasp of `propose` that `rank` puts first, for the visible points.
 
     A row for which no grasp can be proposed is invalid, with the reason.
     """
     # A row is NaN until a grasp is proposed.
-    hand = load_hand(dataset_config(scene.data).hand_source)
-    poses = unpack_pose(scene.data.column(f"object_props/frame_work2cam_{scene.data.camera}"))
-    count, joints = len(scene.rows), len(hand.joint_names)
+    hand = load_hand(dataset_config(inputs.data).hand_source)
+    poses = unpack_pose(inputs.data.column(f"object_props/frame_work2cam_{inputs.data.camera}"))
+    count, joints = len(inputs.rows), len(hand.joint_names)
     X_TG = np.full((count, 4, 4), np.nan)
     q, reasons = np.full((2, count, joints), np.nan), [""] * count
 
-    for i, row in enumerate(scene.rows):
+    for i, row in enumerate(inputs.rows):
         try:
-            best = _chosen(transform_points(poses[row], scene.visible(row)), hand)
+            best = _chosen(transform_points(poses[row], inputs.visible(row)), hand)
         except (GraspError, HandError) as reason:
             reasons[i] = str(reason)
         else:
@@ -204,13 +204,13 @@ def closing(scene: Scene) -> GraspTable:
 
     return make_attempts(
         hand,
-        scene.data.column("object_props/object_name")[list(scene.rows)].tolist(),
+        inputs.data.column("object_props/object_name")[list(inputs.rows)].tolist(),
         X_TG,
         q[0],
         q_pregrasp=q[1],
         frame="table",
         invalid=reasons,
-        of_row=np.array(scene.rows, dtype=np.int64),
+        of_row=np.array(inputs.rows, dtype=np.int64),
     )
 
 
@@ -224,7 +224,7 @@ def _chosen(p_TQ: Array, hand: Hand) -> GraspTable:
 class Reference:
     """A reference: the function that makes its rows, a description, whether it needs training."""
 
-    make: Callable[[Scene], Array | GraspTable]
+    make: Callable[[ReferenceInput], Array | GraspTable]
     words: str
     trained: bool = True
 

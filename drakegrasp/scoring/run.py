@@ -23,7 +23,7 @@ from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
 from drakegrasp.scoring.card import card_of, card_text
 from drakegrasp.scoring.measures import Grouping, Judged
-from drakegrasp.scoring.references import REFERENCES, Scene
+from drakegrasp.scoring.references import REFERENCES, ReferenceInput
 from drakegrasp.scoring.verdict import Verdict, VerdictFile, rank_array, verdict_key
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.attempts import GraspRows, GraspTable, Rows, join_rows
@@ -115,10 +115,10 @@ def score(
         for name, ranked in methods.items()
         if ranked
     }
-    scene = Scene(data=data, rows=rows, train=train)
+    inputs = ReferenceInput(data=data, rows=rows, train=train)
     for name in references:
         if len(train) or not REFERENCES[name].trained:
-            sets[name] = (rank_array(name, REFERENCES[name].make(scene), data, rows),)
+            sets[name] = (rank_array(name, REFERENCES[name].make(inputs), data, rows),)
     if not sets:
         raise GraspError("there must be predictions or reference rows to score, got none")
 

@@ -33,7 +33,7 @@ from drakegrasp.verification.prediction import read_several
 from drakegrasp.verification.result import Verification
 
 
-def rank(table: Rows) -> Rows:
+def sorted_by_rank(table: Rows) -> Rows:
     """Return predictions for rows of a split, ordered by row and by rank within a row."""
     table = ranked(table, table.of_row)
     return table.at(np.lexsort((table.rank, table.of_row)).tolist())
@@ -62,13 +62,13 @@ def rank_array(
     """
     if isinstance(grasps, GraspRows):
         sha256 = hashlib.sha256(np.ascontiguousarray(grasps.numbers()).tobytes()).hexdigest()
-        return rank(replace(grasps, file=name, sha256=sha256))
+        return sorted_by_rank(replace(grasps, file=name, sha256=sha256))
     fingers = data.column("grasps").shape[1] // 6
     with named(Path(name)):
         array = as_numbers(grasps, "grasps must be numbers")
         table = read_several(array, data, fingers=fingers, rows=rows, confidence=confidence)
         sha256 = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
-        return rank(replace(table, file=name, sha256=sha256))
+        return sorted_by_rank(replace(table, file=name, sha256=sha256))
 
 
 def rank_file(
@@ -87,7 +87,7 @@ def rank_file(
             raise GraspError(
                 f"preshape must be one for a score, which tries nothing twice, got {EACH}"
             )
-        return rank(replace(table, file=str(path), sha256=digest_of(path)))
+        return sorted_by_rank(replace(table, file=str(path), sha256=digest_of(path)))
 
 
 def ranked_sets(

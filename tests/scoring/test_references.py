@@ -12,12 +12,14 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.frames import rotate_vectors, transform_points, unpack_pose
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.scoring import references
-from drakegrasp.scoring.references import REFERENCES, Scene
+from drakegrasp.scoring.references import REFERENCES, ReferenceInput
 
 
 @pytest.fixture(scope="module")
-def scene(data):
-    return Scene(data=data, rows=range(len(data)), train=GraspDataset(data.path, split="train"))
+def inputs(data):
+    return ReferenceInput(
+        data=data, rows=range(len(data)), train=GraspDataset(data.path, split="train")
+    )
 
 
 #: Those that are grasps of contacts.
@@ -25,69 +27,69 @@ CONTACTS = [name for name in REFERENCES if name != "closing"]
 
 
 @pytest.mark.parametrize("name", CONTACTS)
-def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(scene, name):
-    grasps = REFERENCES[name].make(scene)
-    assert grasps.shape == (len(scene.rows), 18)
+def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(inputs, name):
+    grasps = REFERENCES[name].make(inputs)
+    assert grasps.shape == (len(inputs.rows), 18)
     lengths = np.linalg.norm(grasps[:, 9:].reshape(-1, 3, 3), axis=-1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-6)
-    np.testing.assert_array_equal(REFERENCES[name].make(scene), grasps)
+    np.testing.assert_array_equal(REFERENCES[name].make(inputs), grasps)
 
 
-def test_own_grasps_are_the_stored_ones(scene):
-    np.testing.assert_array_equal(references.own(scene), scene.data.column("grasps"))
+def test_own_grasps_are_the_stored_ones(inputs):
+    np.testing.assert_array_equal(references.own(inputs), inputs.data.column("grasps"))
 
 
 @pytest.mark.parametrize("name", ["constant", "random"])
-def test_blind_rows_are_training_grasps_and_never_look(scene, name, monkeypatch):
-    value = scene.data.value
+def test_blind_rows_are_training_grasps_and_never_look(inputs, name, monkeypatch):
+    value = inputs.data.value
 
     def blind(field, row):
         assert field not in ("images", "masks")
         return value(field, row)
 
-    monkeypatch.setattr(scene.data, "value", blind)
-    made = {tuple(grasp) for grasp in REFERENCES[name].make(scene)}
-    assert made <= {tuple(grasp) for grasp in scene.train_grasps}
+    monkeypatch.setattr(inputs.data, "value", blind)
+    made = {tuple(grasp) for grasp in REFERENCES[name].make(inputs)}
+    assert made <= {tuple(grasp) for grasp in inputs.train_grasps}
     assert name != "constant" or len(made) == 1
 
 
-def test_the_nearest_image_of_a_training_image_is_itself(scene):
-    same = Scene(data=scene.train, rows=range(len(scene.train)), train=scene.train)
-    np.testing.assert_array_equal(references.nearest_image(same), scene.train_grasps)
+def test_the_nearest_image_of_a_training_image_is_itself(inputs):
+    same = ReferenceInput(data=inputs.train, rows=range(len(inputs.train)), train=inputs.train)
+    np.testing.assert_array_equal(references.nearest_image(same), inputs.train_grasps)
 
 
-def test_a_grasp_from_above_closes_level_across_the_object(scene):
-    poses = scene.data.column("object_props/frame_work2cam_oto")
-    for row, grasp in zip(scene.rows, references.top_down(scene), strict=True):
+def test_a_grasp_from_above_closes_level_across_the_object(inputs):
+    poses = inputs.data.column("object_props/frame_work2cam_oto")
+    for row, grasp in zip(inputs.rows, references.top_down(inputs), strict=True):
         X_TC = unpack_pose(poses[row])
         points, normals = unpack_grasp(grasp)
         p_TQ, nhat_Q_T = transform_points(X_TC, points), rotate_vectors(X_TC, normals)
         np.testing.assert_allclose(p_TQ[:, 2], p_TQ[0, 2])
         np.testing.assert_allclose(nhat_Q_T[:, 2], 0.0, atol=1e-6)
-        others = [i for i in range(3) if i != scene.thumb]
-        np.testing.assert_allclose(nhat_Q_T[others], -nhat_Q_T[[scene.thumb] * 2], atol=1e-6)
+        others = [i for i in range(3) if i != inputs.thumb]
+        np.testing.assert_allclose(nhat_Q_T[others], -nhat_Q_T[[inputs.thumb] * 2], atol=1e-6)
         # Each contact is on the side to which its normal points.
         middle = p_TQ.mean(axis=0)
         assert (((p_TQ - middle) * nhat_Q_T).sum(axis=1) > 0.0).all()
 
 
-def test_closing_gives_the_posture_that_is_ranked_first_for_what_is_seen(scene):
-    scene = replace(scene, rows=scene.rows[:2])
-    table = references.closing(scene)
-    assert table.of_row.tolist() == list(scene.rows)
+def test_closing_gives_the_posture_that_is_ranked_first_for_what_is_seen(inputs):
+    inputs = replace(inputs, rows=inputs.rows[:2])
+    table = references.closing(inputs)
+    assert table.of_row.tolist() == list(inputs.rows)
     assert not table.refused
     assert table.frame == "table"
-    poses = scene.data.column("object_props/frame_work2cam_oto")
-    for i, row in enumerate(scene.rows):
-        cloud = transform_points(unpack_pose(poses[row]), scene.visible(row))
+    poses = inputs.data.column("object_props/frame_work2cam_oto")
+    for i, row in enumerate(inputs.rows):
+        cloud = transform_points(unpack_pose(poses[row]), inputs.visible(row))
         found = dg.propose(cloud)
         best = dg.rank(found, cloud).order[0]
         for name in ("X_FG", "q_grasp", "q_pregrasp"):
             np.testing.assert_array_equal(getattr(table, name)[i], getattr(found, name)[best])
 
 
-def test_a_row_of_which_nothing_is_seen_is_no_grasp(scene, monkeypatch):
-    visible = Scene.visible
-    monkeypatch.setattr(Scene, "visible", lambda self, row: visible(self, row)[:5])
-    table = references.closing(scene)
+def test_a_row_of_which_nothing_is_seen_is_no_grasp(inputs, monkeypatch):
+    visible = ReferenceInput.visible
+    monkeypatch.setattr(ReferenceInput, "visible", lambda self, row: visible(self, row)[:5])
+    table = references.closing(inputs)
     assert "10 or more, got 5" in table.invalid[0]

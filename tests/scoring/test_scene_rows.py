@@ -18,7 +18,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.scoring.benchmark import rows_digest
-from drakegrasp.scoring.references import REFERENCES, Scene
+from drakegrasp.scoring.references import REFERENCES, ReferenceInput
 from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
@@ -66,14 +66,14 @@ def test_palms_of_the_own_grasps_are_those_of_their_trials(path):
 
 def test_images_show_the_object_where_the_grasp_is(path):
     rows = SceneRows(path, split="test")
-    scene = Scene(data=rows, rows=range(len(rows)), train=open_rows(path, split="train"))
+    inputs = ReferenceInput(data=rows, rows=range(len(rows)), train=open_rows(path, split="train"))
     contacts = Trials(path.parent)[rows.column("trial_id")]["closed_p_OQ"]
-    for row in scene.rows:
+    for row in inputs.rows:
         with h5py.File(path) as file:
             X_TO = file["scenes/X_TO"][file["views/scene"][rows.views[row]], 0].reshape(3, 4)
             X_TC = file["views/X_TC"][rows.views[row]].reshape(3, 4)
         p_TQ = transform_points(np.vstack([X_TO, [0, 0, 0, 1]]), contacts[row])
-        seen = transform_points(np.vstack([X_TC, [0, 0, 0, 1]]), scene.visible(row))
+        seen = transform_points(np.vstack([X_TC, [0, 0, 0, 1]]), inputs.visible(row))
         apart = np.linalg.norm(p_TQ.mean(axis=0) - seen.mean(axis=0))
         assert apart < 0.06
         assert rows.value("images", row).shape == (4, 240, 320)
@@ -85,7 +85,7 @@ def test_images_show_the_object_where_the_grasp_is(path):
 def test_every_reference_can_be_made_on_views(path, name):
     rows = open_rows(path, split="test")
     train = open_rows(path, split="train")
-    made = REFERENCES[name].make(Scene(data=rows, rows=range(len(rows)), train=train))
+    made = REFERENCES[name].make(ReferenceInput(data=rows, rows=range(len(rows)), train=train))
     if isinstance(made, GraspTable):
         assert len(made) == len(rows) and not made.refused
         return
