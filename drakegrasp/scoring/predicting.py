@@ -32,7 +32,7 @@ from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.scoring.ranking import Ranking, chosen_hand, rank
 from drakegrasp.simulation.attempts import GraspTable, join_attempts, make_attempts
-from drakegrasp.simulation.closing import closed_on
+from drakegrasp.simulation.closing import closing_positions
 from drakegrasp.simulation.palms import Palms
 from drakegrasp.simulation.posture import joint_order
 from drakegrasp.vision.depth_image import View, cloud_from_depth
@@ -76,7 +76,7 @@ def propose(
     q_opened, q_grasp = np.zeros((2, count, len(names)))
     for spread in dict.fromkeys(spreads):
         rows = np.flatnonzero(np.array(spreads) == spread)
-        closing = closed_on(solid, shaped, spread, poses[rows])
+        closing = closing_positions(solid, shaped, spread, poses[rows])
         for q, closed in ((q_opened, np.zeros_like(closing)), (q_grasp, closing)):
             for row, each in zip(rows, closed, strict=True):
                 at = joint_positions(shaped, spread, each)

@@ -35,7 +35,7 @@ from drakegrasp.objects.model import object_of
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt, usual_conditions
 from drakegrasp.simulation.attempts import GraspTable
-from drakegrasp.simulation.closing import close_on
+from drakegrasp.simulation.closing import closing_features
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import start_of
 from drakegrasp.simulation.scene_cache import run_cached
@@ -279,7 +279,7 @@ def _closed(
     closing = np.array([opened if s.closing is None else s.closing for s in starts])
     closing = np.repeat(closing, len(MOVES), axis=0)
 
-    found = [close_on(solid, hand, spread, moved, closing=closing) for solid in solids]
+    found = [closing_features(solid, hand, spread, moved, closing=closing) for solid in solids]
     shape = len(solids), len(starts), len(MOVES)
     return {
         name: np.reshape([each[name] for each in found], (*shape, *values.shape[1:]))

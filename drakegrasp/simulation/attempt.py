@@ -195,7 +195,7 @@ def conditions_from(stream: Stream, model: ObjectModel, config: Config) -> Condi
 
     return replace(
         usual,
-        materials=_materials(usual.materials, rules, drawn),
+        materials=_drawn_materials(usual.materials, rules, drawn),
         appearance=_appearance(usual.appearance, rules, drawn),
         X_C0C=_camera_jitter(rules, drawn),
         sensor=DepthSensor(
@@ -206,7 +206,9 @@ def conditions_from(stream: Stream, model: ObjectModel, config: Config) -> Condi
     )
 
 
-def _materials(usual: Materials, rules: RandomizeConfig, drawn: dict[str, Array]) -> Materials:
+def _drawn_materials(
+    usual: Materials, rules: RandomizeConfig, drawn: dict[str, Array]
+) -> Materials:
     return Materials(
         **{
             name: getattr(usual, name) * _between(getattr(rules, name), drawn[name], 1.0)

@@ -44,7 +44,7 @@ CONSTANT = -3.0
 _NO_MOTION = np.eye(4)
 
 
-def close_on(
+def closing_features(
     solid: Solid,
     hand: Hand,
     spread: float,
@@ -116,7 +116,7 @@ def close_on(
     return {"score": free / (1.0 + _decay(logit)), **features}
 
 
-def closed_on(solid: Solid, hand: Hand, spread: float, X_SG: Array) -> Array:
+def closing_positions(solid: Solid, hand: Hand, spread: float, X_SG: Array) -> Array:
     """Return closing positions (n, k) [rad or m] of a hand that is open at n palm poses and closes.
 
     Args:

@@ -3,9 +3,9 @@
 At a resting pose the first palms are the fixed ones of `palms.Palms`. Then palms are drawn in
 rounds: from the same family, with random places, heights, turns and slants; near palms that close
 well; and at surface points, for rims and handles of what is too wide for the hand. Geometry closes
-the hand on the surface (`closing.close_on`), and palms that close much worse than the best ones are
-left out. Directions take turns, and so do palms from above, slanted and from the side. Palms near
-an earlier one are left out, until there is no other.
+the hand on the surface (`closing.closing_features`), and palms that close much worse than the best
+ones are left out. Directions take turns, and so do palms from above, slanted and from the side.
+Palms near an earlier one are left out, until there is no other.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from drakegrasp.mesh.surfaces import even_points, on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.attempt import palm_motion
-from drakegrasp.simulation.closing import close_on
+from drakegrasp.simulation.closing import closing_features
 from drakegrasp.simulation.palms import DEEPER, Palms, Shape
 from drakegrasp.simulation.screen import centre
 
@@ -213,7 +213,7 @@ class Closing:
             if own:
                 hand = self._hand.at(shape.preshape)
                 X_OG = centre(self._model, hand, shape.spread, multiply(self._X_OL, np.array(own)))
-                found = close_on(self._solid, hand, shape.spread, X_OG, X_TS=self._X_LO)
+                found = closing_features(self._solid, hand, shape.spread, X_OG, X_TS=self._X_LO)
                 rows = zip(multiply(self._X_LO, X_OG), found["score"].tolist(), strict=True)
                 palms += [ScoredPalm(X_LG, shape, score) for X_LG, score in rows]
         return palms

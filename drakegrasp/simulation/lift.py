@@ -138,7 +138,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config, materials: Materials
 
             # Choose the next step size, and move the state to the diagram that has it.
             if now < end and not certain and not moved:
-                chosen = _scene_for(scene, monitor.at_rest)
+                chosen = _scene_with_step(scene, monitor.at_rest)
                 if chosen is not current:
                     used.append(chosen)
                     set_materials(chosen, materials)
@@ -187,7 +187,8 @@ def _on_grid(time: float, config: Config) -> float:
     return float(np.ceil(time / step - ROUNDING) * step)
 
 
-def _scene_for(scene: Scene, at_rest: bool) -> Scene:
+def _scene_with_step(scene: Scene, at_rest: bool) -> Scene:
+    """Return the scene with long time steps if everything is at rest and it has them."""
     return scene.coarse_scene() if at_rest and scene.coarse_scene is not None else scene
 
 

@@ -2,8 +2,8 @@
 
 Input: points of the object's surface in {T}, where the table is z = 0: all of them, or those that a
 camera saw. Output: palm poses that aim at the object, with a spread. They look down on it, slant,
-or come from the side, and close across what is narrow there. `closing.close_on` tells which would
-hold. `scoring.predicting` proposes the fixed palms, and the sampler `closing` tries both.
+or come from the side, and close across what is narrow there. `closing.closing_features` tells which
+would hold. `scoring.predicting` proposes the fixed palms, and the sampler `closing` tries both.
 """
 
 from __future__ import annotations

@@ -176,7 +176,7 @@ def run_attempt(
         OSError: If a file of the hand cannot be read.
     """
     drive_of(scene.hand, config.lift)
-    scene = _scene_for(scene, attempt)
+    scene = _scene_with_motors(scene, attempt)
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG)
     try:
@@ -189,7 +189,7 @@ def run_attempt(
         record = _close(scene, start, attempt, config, limits, screening)
         if record.outcome is not Outcome.SUCCESS:
             return record
-        return _lift(scene, record, config, limits, _materials(scene, attempt))
+        return _lift(scene, record, config, limits, _materials_of(scene, attempt))
     except TrialTimeout:
         return replace(start, outcome=Outcome.TIMEOUT)
     except (MemoryError, OSError):
@@ -207,12 +207,12 @@ def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, lis
         X_TO: Resting pose of the object, (4, 4).
         attempt: The attempt.
     """
-    scene = _scene_for(scene, attempt)
+    scene = _scene_with_motors(scene, attempt)
     _place(scene, X_TO, attempt, attempt.closing)
     return open_hand_meets(scene)
 
 
-def _scene_for(scene: Scene, attempt: Attempt) -> Scene:
+def _scene_with_motors(scene: Scene, attempt: Attempt) -> Scene:
     """Return the scene with the motors of an attempt."""
     if attempt.own_motors and scene.own_motors is not None:
         return scene.own_motors()
@@ -242,12 +242,12 @@ def _start(
         return screened
 
     # If the open hand is close to a collision, Drake decides whether it collides.
-    set_materials(scene, _materials(scene, attempt))
+    set_materials(scene, _materials_of(scene, attempt))
     _place(scene, X_TO, attempt, attempt.closing)
     return Outcome.START_COLLISION if open_hand_meets(scene) else screened
 
 
-def _materials(scene: Scene, attempt: Attempt) -> Materials:
+def _materials_of(scene: Scene, attempt: Attempt) -> Materials:
     """Return the friction and mass of an attempt; by default those of the scene."""
     if attempt.conditions is None:
         return usual_materials(scene.model, scene.physics)

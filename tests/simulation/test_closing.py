@@ -14,7 +14,7 @@ from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.cloud import Solid
 from drakegrasp.mesh.distance_field import make_distance_field
-from drakegrasp.simulation.closing import close_on, closed_on
+from drakegrasp.simulation.closing import closing_features, closing_positions
 
 #: Distance of the tips from the palm, and of a jaw from the middle; half the width of the box [m].
 TIPS, JAW, HALF = 0.10, 0.04, 0.02
@@ -61,10 +61,10 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Hand:
 
 def test_jaws_stop_at_the_faces_of_a_box(jaws: Hand) -> None:
     X_TG = np.stack([down(), down(y=0.01)])
-    found = close_on(solid(box()), jaws, 0.0, X_TG)
+    found = closing_features(solid(box()), jaws, 0.0, X_TG)
     # The second palm is 10 mm beside the middle, and each jaw has its own motor.
     travel = np.array([[0.02, 0.02], [0.03, 0.01]])
-    np.testing.assert_allclose(closed_on(solid(box()), jaws, 0.0, X_TG), travel, atol=BLUR)
+    np.testing.assert_allclose(closing_positions(solid(box()), jaws, 0.0, X_TG), travel, atol=BLUR)
     assert (found["gap"] < BLUR).all()
     assert found["touch"].all() and found["robust"].all()
     np.testing.assert_allclose(found["push"], 1.0, atol=1e-3)
@@ -73,42 +73,42 @@ def test_jaws_stop_at_the_faces_of_a_box(jaws: Hand) -> None:
 
 def test_two_opposed_contacts_balance(jaws: Hand) -> None:
     """The jaws meet a ball at its equator, where forces and moments cancel."""
-    found = close_on(solid(ball()), jaws, 0.0, down()[None])
-    travel = closed_on(solid(ball()), jaws, 0.0, down()[None])
+    found = closing_features(solid(ball()), jaws, 0.0, down()[None])
+    travel = closing_positions(solid(ball()), jaws, 0.0, down()[None])
     np.testing.assert_allclose(travel, JAW - 0.03, atol=SPACING / 4)
     assert found["push"] > 0.98
     assert found["opposition"] > 0.9
     assert found["arm"] < SPACING
     # Beside the middle, the normals point away from it.
-    beside = close_on(solid(ball()), jaws, 0.0, down(x=0.02)[None])
+    beside = closing_features(solid(ball()), jaws, 0.0, down(x=0.02)[None])
     assert beside["opposition"] < 0.8 and beside["push"] < found["push"]
     assert beside["score"] < found["score"]
 
 
 def test_a_jaw_that_ends_before_the_object_has_a_gap(jaws: Hand) -> None:
     """A wall 4.5 to 14.5 mm beside the middle, which one jaw meets; the other one ends at 0."""
-    found = close_on(solid(box(width=0.01, y=-0.0095)), jaws, 0.0, down()[None])
+    found = closing_features(solid(box(width=0.01, y=-0.0095)), jaws, 0.0, down()[None])
     np.testing.assert_allclose(found["gap"], 0.0045, atol=BLUR)
     assert found["touch"].tolist() == [[0.0, 1.0]]
     assert found["score"] > 0.0 and not found["robust"].any()
     # One contact balances nothing, and none does, above the wall.
-    above = close_on(solid(box(width=0.01)), jaws, 0.0, down(z=0.25)[None])
+    above = closing_features(solid(box(width=0.01)), jaws, 0.0, down(z=0.25)[None])
     assert not above["touch"].any()
     assert found["opposition"] == above["opposition"] == 0.0
 
 
 def test_jaws_with_one_motor_stop_together(shared: Hand) -> None:
     """2 mm beside the middle: the first jaw stops after 18 mm, and the other has 4 mm to go."""
-    found = close_on(solid(box()), shared, 0.0, down(y=0.002)[None])
+    found = closing_features(solid(box()), shared, 0.0, down(y=0.002)[None])
     np.testing.assert_allclose(found["gap"], 0.004, atol=BLUR)
-    travel = closed_on(solid(box()), shared, 0.0, down(y=0.002)[None])
+    travel = closing_positions(solid(box()), shared, 0.0, down(y=0.002)[None])
     np.testing.assert_allclose(travel, 0.018, atol=BLUR)
 
 
 def test_a_hand_may_begin_to_close_from_other_positions(jaws: Hand) -> None:
     """At 10 mm it still stops at the faces; at 25 mm the jaws are 5 mm within the box."""
     starts = np.array([[0.01, 0.01], [0.025, 0.025]])
-    found = close_on(solid(box()), jaws, 0.0, np.stack([down()] * 2), closing=starts)
+    found = closing_features(solid(box()), jaws, 0.0, np.stack([down()] * 2), closing=starts)
     np.testing.assert_allclose(found["gap"][0], 0.0, atol=BLUR)
     assert (found["score"] > 0.0).tolist() == found["robust"].tolist() == [True, False]
     np.testing.assert_allclose(found["clearance"][1], -0.005, atol=BLUR)
