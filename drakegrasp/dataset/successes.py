@@ -168,8 +168,8 @@ def judge_successes(
             removal[rows[outside]] = Removal.OUTLIER
 
     # The inspection comes last, since it only saw samples.
-    listed = np.isin(successes["trial_id"], np.asarray(rejected, dtype=np.int64))
-    removal[listed & (removal == Removal.KEPT)] = Removal.REJECTED
+    is_rejected = np.isin(successes["trial_id"], np.asarray(rejected, dtype=np.int64))
+    removal[is_rejected & (removal == Removal.KEPT)] = Removal.REJECTED
     return removal
 
 
