@@ -16,8 +16,7 @@ from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.cluster.wire import by_wire
 from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import BUILD_PRESET, Config
-from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER
-from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, MANIFEST_FILE
 from drakegrasp.errors import DataError, GraspError, MeshError, counted, listed
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.foreign_files import validate_local
@@ -261,7 +260,9 @@ def make_benchmark(
     running, folder = joined(client, workers), Path(out).absolute()
     config = build_config(load_config(PRESET, list(overrides)))
     names = list(only) or [each.name for each in draw_builtin(config.builtin)]
-    if (folder / MANIFEST).exists() and not (folder / BUILTIN_FOLDER / BENCHMARK_FILE).is_file():
+    if (folder / MANIFEST_FILE).exists() and not (
+        folder / BUILTIN_FOLDER / BENCHMARK_FILE
+    ).is_file():
         raise DataError(
             f"{folder}: must be empty or hold {NAME}, got another dataset; choose another OUT"
         )

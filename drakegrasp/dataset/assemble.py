@@ -50,7 +50,7 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.paths import (
     ASSEMBLED_FILES,
     DATA_FILES,
-    FILE_NAME,
+    MANIFEST_FILE,
     TRIALS_FILE,
     model_path,
 )
@@ -187,7 +187,7 @@ def assemble_locked(
             _write_rows(out, surveyed, files, progress)
 
         # The manifest, with filters, split and rejections, changes together with the files.
-        new(FILE_NAME).write_bytes(manifest_text(manifest))
+        new(MANIFEST_FILE).write_bytes(manifest_text(manifest))
     return summarise(out)
 
 
@@ -451,8 +451,8 @@ def validate_assembled(out: Path) -> None:
         with open_trials(out / name) if name == TRIALS_FILE else open_samples(out / name):
             pass  # the mistake of a file is told first
     raise DataError(
-        f"{out}: files must be those of {FILE_NAME}, got others: `drakegrasp assemble` or the same "
-        "build again writes them"
+        f"{out}: files must be those of {MANIFEST_FILE}, got others: `drakegrasp assemble` or the "
+        "same build again writes them"
     )
 
 

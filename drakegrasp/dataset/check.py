@@ -38,7 +38,7 @@ from drakegrasp.dataset.hdf5 import (
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import (
     DATA_FILES,
-    FILE_NAME,
+    MANIFEST_FILE,
     SCENES_FILE,
     TRIALS_FILE,
     model_path,
@@ -198,7 +198,7 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     """Return what a dataset's manifest and the headers of its files show, and all tasks."""
     manifest, seals, headers = read_manifest(out), "", dict[str, _Header]()
     found = check_hand(manifest)
-    with _reported(found, FILE_NAME, "objects of one group must be in one split"):
+    with _reported(found, MANIFEST_FILE, "objects of one group must be in one split"):
         manifest.homes()
     with suppress(DataError):  # a missing shard is found with its object
         seals = shards_sha256(out, manifest)
@@ -263,7 +263,7 @@ def _header(path: Path, due: Mapping[str, Any], found: list[Violation]) -> _Head
     told = [key for key in keys if key in due and key in attributes and key != "config"]
     other = next((key for key in told if not np.array_equal(attributes[key], due[key])), "")
     if other:
-        of = "the shards that are there" if other == "shards" else FILE_NAME
+        of = "the shards that are there" if other == "shards" else MANIFEST_FILE
         command = "scenes" if path.name == SCENES_FILE else "assemble"
         again = f"another; run `drakegrasp {command}` again"
         what = f"attribute {other} must be that of {of}"
@@ -311,7 +311,7 @@ def _check_object(out: Path, entry: ObjectEntry, headers: Iterable[ShardHeader])
         expected = recorded_model(out, entry.name)
         with _reported(found, names[model], "the meshes must be as they were written"):
             validate_model_file(out, entry.name, expected)
-    with _reported(found, names[model], f"the meshes must be those of {FILE_NAME}"):
+    with _reported(found, names[model], f"the meshes must be those of {MANIFEST_FILE}"):
         if (sha256 := load_object(model).mesh_sha256) != entry.mesh_sha256:
             raise DataError(f"mesh_sha256 must be {entry.mesh_sha256}, got {sha256}")
     for header in headers:
@@ -326,7 +326,7 @@ def check_hand(manifest: Manifest) -> list[Violation]:
     """Return a violation if the hand in a dataset is not the one that it was built with."""
     source, found = manifest.config.hand_source, list[Violation]()
     if isinstance(source, CarriedHand):  # else the dataset does not contain its hand
-        with _reported(found, HAND_FOLDER, f"the hand must be that of {FILE_NAME}"):
+        with _reported(found, HAND_FOLDER, f"the hand must be that of {MANIFEST_FILE}"):
             if (digest := hand_digest(source)) != source.digest:
                 raise DataError(f"it must be {source.digest}, got {digest}")
     return found

@@ -34,7 +34,7 @@ from drakegrasp.config import (
 )
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.dataset.lock import FOLDERS, LOCK_FILE, unwritable
-from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.paths import MANIFEST_FILE
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import (
     CONVENTIONS,
@@ -288,7 +288,7 @@ def origin_attributes(
 
 def write_manifest(manifest: Manifest, out: Path) -> None:
     """Write the manifest into a dataset's directory, atomically."""
-    write_atomic(out / FILE_NAME, manifest_text(manifest))
+    write_atomic(out / MANIFEST_FILE, manifest_text(manifest))
 
 
 def manifest_text(manifest: Manifest) -> bytes:
@@ -329,13 +329,13 @@ def read_manifest(out: Path) -> Manifest:
     Raises:
         DataError: If the manifest is missing, cannot be read or has another schema.
     """
-    path = out / FILE_NAME
+    path = out / MANIFEST_FILE
     # A missing file gets another message than a broken one.
     try:
         tree, content = read_mapping(path, "a readable manifest")
     except (FileNotFoundError, NotADirectoryError):
         raise DataError(
-            f"{out.absolute()}: must be the directory of a dataset, got one without {FILE_NAME}"
+            f"{out.absolute()}: must be the directory of a dataset, got one without {MANIFEST_FILE}"
         ) from None
 
     # Check the version first: another schema may have other keys.
@@ -400,7 +400,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
         raise unwritable(out, error) from None
 
     # Without a manifest, it may only contain what an interrupted build leaves.
-    if not (out / FILE_NAME).exists():
+    if not (out / MANIFEST_FILE).exists():
         _validate_no_other_files(out)
         return None
 
@@ -434,13 +434,13 @@ def _validate_no_other_files(out: Path) -> None:
     if others:
         raise DataError(
             f"{out}: must be empty or hold a dataset of drakegrasp, got {others[0]!r} "
-            f"and no {FILE_NAME}; choose another --out"
+            f"and no {MANIFEST_FILE}; choose another --out"
         )
 
 
 def release_directory(out: Path) -> None:
     """Remove the files of a build that produced nothing, and the directory if it is then empty."""
-    (out / FILE_NAME).unlink(missing_ok=True)
+    (out / MANIFEST_FILE).unlink(missing_ok=True)
     if not (out / HAND_FOLDER).is_symlink():
         shutil.rmtree(out / HAND_FOLDER, ignore_errors=True)
     # A directory with any other content existed before.

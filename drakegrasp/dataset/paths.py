@@ -15,7 +15,7 @@ from drakegrasp.runtime.files import validate_seal
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 SCENES_FILE = "scenes.hdf5"
-FILE_NAME = "manifest.json"
+MANIFEST_FILE = "manifest.json"
 #: Files that `assemble` writes; they always belong to one state.
 ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.

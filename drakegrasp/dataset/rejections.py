@@ -20,7 +20,7 @@ from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
 from drakegrasp.errors import DataError, printable
 from drakegrasp.runtime.files import write_atomic
 
-FILE_NAME = "reject.json"
+REJECT_FILE = "reject.json"
 #: Version of the file's layout.
 VERSION = 1
 #: Maximum number of rejections without effect that a message names.
@@ -166,7 +166,7 @@ def unused_rejections(
         ]
 
     # Rejections of an inspection that were not requested.
-    path = out / FILE_NAME
+    path = out / REJECT_FILE
     try:
         forgotten = read_decisions(path).rejected - set(used)
     except (DataError, OSError):

@@ -26,7 +26,7 @@ from drakegrasp.dataset.manifest import (
     package_versions,
     release_directory,
 )
-from drakegrasp.dataset.paths import FILE_NAME, places
+from drakegrasp.dataset.paths import MANIFEST_FILE, places
 from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import ConfigError, DataError, counted, listed
 from drakegrasp.hand.description import load_hand
@@ -141,7 +141,7 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
                 notices=tuple(notices),
             )
         finally:
-            if not (out / FILE_NAME).exists():
+            if not (out / MANIFEST_FILE).exists():
                 release_directory(out)
 
 

@@ -137,13 +137,13 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
         path = header.journal_path(out)
         if summary is None:
             with open_journal(path, header.stored, restartable=unit.restartable) as journal:
-                summary = _Experiment(unit, journal).run()
+                summary = _UnitRun(unit, journal).run()
         path.unlink(missing_ok=True)
         trim_memory()
         return summary
 
 
-class _Experiment:
+class _UnitRun:
     """The attempts of a unit, with the journal of its steps."""
 
     def __init__(self, unit: WorkUnit, journal: Journal) -> None:

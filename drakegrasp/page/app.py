@@ -33,7 +33,7 @@ from starlette.staticfiles import StaticFiles
 
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, SCENES_FILE
 from drakegrasp.dataset.rejections import (
-    FILE_NAME,
+    REJECT_FILE,
     AttemptKey,
     Decisions,
     read_decisions,
@@ -90,7 +90,7 @@ class DecisionFile:
     """
 
     def __init__(self, out: Path) -> None:
-        self._path = out / FILE_NAME
+        self._path = out / REJECT_FILE
         self._lock = threading.Lock()
         self._last: Step | None = None
         self.read()

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.quality import PARTS
-from drakegrasp.dataset.rejections import FILE_NAME, Decisions
+from drakegrasp.dataset.rejections import REJECT_FILE, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.successes import own_setting
 from drakegrasp.dataset.trials import NONE
@@ -115,7 +115,7 @@ class AttemptGallery(Gallery):
         The command names user-defined filters again, since a dataset stores only their names.
         """
         out = self.snapshot.out
-        words = ["drakegrasp", "assemble", str(out), "--reject", str(out / FILE_NAME)]
+        words = ["drakegrasp", "assemble", str(out), "--reject", str(out / REJECT_FILE)]
         if own := own_setting(self.snapshot.config.filters):
             words += ["--set", own]
         return {"token": self.token, "counts": self.counts(), "assemble": shlex.join(words)}

@@ -20,7 +20,7 @@ from drakegrasp.dataset.manifest import (
     with_postprocessing,
     write_manifest,
 )
-from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.paths import MANIFEST_FILE
 from drakegrasp.errors import DataError
 from drakegrasp.hand.settings import load_config
 
@@ -61,7 +61,7 @@ def manifest() -> Manifest:
 
 def test_entries_are_written_as_ever(tmp_path: Path, manifest: Manifest) -> None:
     write_manifest(manifest, tmp_path)
-    text = (tmp_path / FILE_NAME).read_text(encoding="utf-8")
+    text = (tmp_path / MANIFEST_FILE).read_text(encoding="utf-8")
     entries = json.dumps(ENTRIES, indent=1, ensure_ascii=False)
     assert text.split(f',\n "{DIGEST}"')[0].endswith(entries.strip("{}\n"))
 
@@ -70,11 +70,11 @@ def test_manifest_that_is_read_and_written_keeps_its_bytes(
     tmp_path: Path, manifest: Manifest
 ) -> None:
     write_manifest(manifest, tmp_path)
-    before = (tmp_path / FILE_NAME).read_bytes()
+    before = (tmp_path / MANIFEST_FILE).read_bytes()
     again = read_manifest(tmp_path)
     assert again == manifest
     write_manifest(again, tmp_path)
-    assert (tmp_path / FILE_NAME).read_bytes() == before
+    assert (tmp_path / MANIFEST_FILE).read_bytes() == before
 
 
 def test_a_value_that_may_be_but_was_not_written_is_refused(
@@ -82,7 +82,7 @@ def test_a_value_that_may_be_but_was_not_written_is_refused(
 ) -> None:
     """A changed bit and a lost hash show; another layout is read."""
     write_manifest(manifest, tmp_path)
-    path = tmp_path / FILE_NAME
+    path = tmp_path / MANIFEST_FILE
     text = path.read_text(encoding="utf-8")
     tree = json.loads(text)
     path.write_text(json.dumps(tree), encoding="utf-8")
@@ -99,7 +99,7 @@ def test_a_value_that_may_be_but_was_not_written_is_refused(
 def test_rule_of_the_split_splits_and_groups_are_stated(tmp_path: Path, manifest: Manifest) -> None:
     objects = (replace(MUG, split="test"), replace(MUG, name="4_morph", group="3_mug"))
     write_manifest(replace(manifest, objects=objects), tmp_path)
-    tree = json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))
+    tree = json.loads((tmp_path / MANIFEST_FILE).read_text(encoding="utf-8"))
     assert tree["split_by"] == "object"
     assert [entry.get("split") for entry in tree["objects"]] == ["test", None]
     assert read_manifest(tmp_path).objects == objects

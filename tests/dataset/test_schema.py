@@ -14,7 +14,7 @@ from helpers.datasets import OTM, OTO, TRIALS, edit_file, edit_manifest, make_da
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import claim_directory
-from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.paths import MANIFEST_FILE
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
@@ -96,12 +96,12 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("opens", "name"),
     [
         (GraspDataset, OTO),
-        (check_dataset, FILE_NAME),
-        (assemble, FILE_NAME),
+        (check_dataset, MANIFEST_FILE),
+        (assemble, MANIFEST_FILE),
         (count_funnel, TRIALS),
         (count_splits, TRIALS),
-        (partial(claim_directory, config=load_config()), FILE_NAME),
-        (partial(replay_trial, trial_id=0), FILE_NAME),
+        (partial(claim_directory, config=load_config()), MANIFEST_FILE),
+        (partial(replay_trial, trial_id=0), MANIFEST_FILE),
     ],
 )
 def test_dataset_of_another_version_gets_one_line(

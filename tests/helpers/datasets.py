@@ -28,7 +28,7 @@ from drakegrasp.dataset.manifest import (
     manifest_digest,
     write_manifest,
 )
-from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.paths import MANIFEST_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
 from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
@@ -369,10 +369,10 @@ def must_find(out: Path, *expected: tuple[str, str, int | None, str], of: str = 
 
 def edit_manifest(out: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
     """Change what a manifest says, as if it had been written so."""
-    tree = json.loads((out / FILE_NAME).read_bytes())
+    tree = json.loads((out / MANIFEST_FILE).read_bytes())
     edit(tree)
     tree[DIGEST] = manifest_digest(tree)
-    (out / FILE_NAME).write_text(json.dumps(tree))
+    (out / MANIFEST_FILE).write_text(json.dumps(tree))
 
 
 def edit_file(path: Path, edit: Callable[[h5py.File], Any]) -> None:
