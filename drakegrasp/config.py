@@ -399,9 +399,9 @@ class ScenesConfig(_Section):
 
 
 class _Filters(_ExtensibleSection):
-    # "held" switches off the rules on how well the object is held: every success that the filters
-    # of images and contacts keep becomes a sample.
-    require: Literal["held", "limits"] = "limits"
+    # "lifted" switches off the rules on how well the hand holds the object: every success that the
+    # filters of images and contacts keep becomes a sample.
+    require: Literal["lifted", "limits"] = "limits"
 
     if TYPE_CHECKING:
 
@@ -469,10 +469,10 @@ class SplitConfig(_Section):
 class VerifyConfig(_Section):
     """How predicted grasps are tried and judged; see docs/how-to/verify-predictions.md."""
 
-    max_contact_error: Positive = 0.02  # [m], between reached and requested contacts of a success
+    max_contact_error: Positive = 0.02  # [m], of reached from requested contacts, to match
     open_margin_deg: Positive = 20.0  # of opening the fingers first; 0.1 m of a slide is 1 rad
     # Maximum number of wrist poses that are simulated until one holds; 1: only the best fit, which
-    # decides success.
+    # decides whether a verdict matches.
     max_tries: Annotated[int, Field(ge=1, le=5)] = 5
 
 
@@ -553,10 +553,10 @@ class Config(_Section):
         # A grasp that a looser filter would keep may be among the lifts that were ended early.
         if self.lift.stop_when == "never":
             return self
-        if self.filters.require == "held":
+        if self.filters.require == "lifted":
             raise ValueError(
                 f"filters.require must be limits where lift.stop_when is {self.lift.stop_when}, "
-                "got held"
+                "got lifted"
             )
         for key, name in (("max_slip", "stop_slip"), ("max_turn_deg", "stop_turn_deg")):
             limit, stop = getattr(self.filters, key), getattr(self.lift, name)

@@ -123,7 +123,7 @@ class Limits(Protocol):
 
     @property
     def require(self) -> str:
-        """`held` switches the filters of the hold off."""
+        """`lifted` switches the filters of the hold off."""
 
     def __getattr__(self, name: str) -> Any: ...
 
@@ -137,7 +137,7 @@ class Filter:
         needs: Names of the columns that it uses; it is not applied to a table without one of them.
         refuses: Given a table of n rows and the limits, returns the rows (n,) that it rejects.
         limit: Name of the limit that can switch it off; empty if it is always on.
-        of_hold: Whether it judges the hold; `require: held` switches such filters off.
+        of_hold: Whether it judges the hold; `require: lifted` switches such filters off.
     """
 
     removal: Removal
@@ -148,7 +148,7 @@ class Filter:
 
     def is_on(self, limits: Limits) -> bool:
         """Return whether the limits switch the filter on."""
-        if self.of_hold and limits.require == "held":
+        if self.of_hold and limits.require == "lifted":
             return False
         if not self.limit:
             return True
@@ -217,7 +217,7 @@ FILTERS = (
         limit="min_depth_variance",
     ),
     _not_finite("grasp_T"),
-    _not_finite("held_O"),
+    _not_finite("lifted_O"),
     at_most(Removal.OFF_SURFACE, "surface_distance", "max_surface_distance"),
     at_most(Removal.NORMAL_OFF, "normal_angle", "max_normal_angle_deg", scale=180.0 / np.pi),
     at_most(Removal.ANOMALOUS, "anomaly", "max_anomaly"),

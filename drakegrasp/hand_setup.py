@@ -155,8 +155,8 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
         scene = build_scene(model, config.physics, hand)
         record = run_attempt(scene, X_TO, pregrasp, locked)
         if not _stays(record, config):
-            held = record.outcome is Outcome.SUCCESS
-            outcomes[MOVED if held else record.outcome.label] += 1
+            lifted = record.outcome is Outcome.SUCCESS
+            outcomes[MOVED if lifted else record.outcome.label] += 1
             continue
         text = (
             f"holds {1e3 * width:.0f} mm and {model.mass:g} kg; {_slip(record)} with "

@@ -15,7 +15,7 @@ class Stage(IntEnum):
 
     PLACED = 0  # geometry only: nothing was simulated
     CLOSED = 1  # the fingers were closed and judged
-    LIFTED = 2  # the object was freed, lifted and judged again
+    TRIED = 2  # a lift was tried: the object was freed, lifted and judged again
 
 
 #: Groups of outcomes in the order of the funnel, each with the minimum stage that its attempts have
@@ -24,10 +24,10 @@ GROUPS = {
     "no ray": Stage.PLACED,
     "collis.": Stage.PLACED,
     "no grip": Stage.CLOSED,
-    "lost": Stage.LIFTED,
-    "moved": Stage.LIFTED,
+    "lost": Stage.TRIED,
+    "moved": Stage.TRIED,
     "errors": Stage.PLACED,
-    "success": Stage.LIFTED,
+    "success": Stage.TRIED,
 }
 
 

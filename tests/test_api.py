@@ -284,7 +284,7 @@ def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: P
         for on, units in [(tmp_path / "cube.obj", None), (str(tmp_path / "cube.obj"), "m"),
                           (box, None), (scaled, "cm"), (placed, None)]
     ]  # fmt: skip
-    assert all(verdict.success for verdict in on_mesh)
+    assert all(verdict.matches for verdict in on_mesh)
     assert len({verdict.epsilon for verdict in on_mesh}) == 1
 
     # A sample is its row, also as a copy, in another process, and of a slice.

@@ -286,16 +286,16 @@ def test_from_scenes_to_predictions(out: Path) -> None:
 
 
 def assert_assessed(out: Path, scenes: Path) -> None:
-    """Each lifted grasp of the split is judged once, and the picture is one."""
+    """Each tested grasp of the split is judged once, and the picture is one."""
     judge = out / "classifier one.pt"
     done = script("assess.py", judge, scenes, out / "curve.png", "--split", "train")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    data = SceneDataset(scenes, split="train", negatives="tested", positives="held")
+    data = SceneDataset(scenes, split="train", negatives="tested", positives="lifted")
     grasps, ours = data.tables["grasps"], data.tables["views"]["scene"][data.views]
-    held = grasps["held"][grasps["tested"] & np.isin(grasps["scene"], ours)]
-    assert found["grasps"] == len(held) == sum(b["grasps"] for b in found["held"]["curve"])
-    assert found["held"]["share"] == pytest.approx(held.mean(), abs=1e-4)
+    lifted = grasps["lifted"][grasps["tested"] & np.isin(grasps["scene"], ours)]
+    assert found["grasps"] == len(lifted) == sum(b["grasps"] for b in found["lifted"]["curve"])
+    assert found["lifted"]["share"] == pytest.approx(lifted.mean(), abs=1e-4)
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -303,8 +303,8 @@ def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: st
     ("overrides", "message"),
     [
         (
-            ["filters.require=held"],
-            r"filters\.require must be limits where lift\.stop_when is .*, got held",
+            ["filters.require=lifted"],
+            r"filters\.require must be limits where lift\.stop_when is .*, got lifted",
         ),
         (["filters.max_slip=null"], r"filters\.max_slip must be at most 0\.01, .*, got null"),
         (["filters.max_slip=0.0101"], r"filters\.max_slip must be at most 0\.01, .* got 0\.0101"),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from drakegrasp.outcomes import Outcome, Stage
 
-PLACED, CLOSED, LIFTED = Stage.PLACED, Stage.CLOSED, Stage.LIFTED
+PLACED, CLOSED, TRIED = Stage.PLACED, Stage.CLOSED, Stage.TRIED
 
 #: Label, frozen number, last stage with results, whether it says nothing about the grasp.
 TABLE = [
-    ("success", 0, LIFTED, False),
+    ("success", 0, TRIED, False),
     ("below_table", 1, PLACED, False),
     ("ray_miss", 2, PLACED, False),
     ("start_collision", 3, PLACED, False),
@@ -16,14 +16,14 @@ TABLE = [
     ("missing_fingertip", 5, CLOSED, False),
     ("hand_contact", 6, CLOSED, False),
     ("table_contact", 7, CLOSED, False),
-    ("slipped", 8, LIFTED, False),
-    ("dropped", 9, LIFTED, False),
+    ("slipped", 8, TRIED, False),
+    ("dropped", 9, TRIED, False),
     ("solver_error", 10, PLACED, True),
     ("timeout", 11, PLACED, True),
     ("crashed", 12, PLACED, True),
-    ("moved", 15, LIFTED, False),
+    ("moved", 15, TRIED, False),
     ("invalid", 17, PLACED, False),
-    ("partly_held", 18, LIFTED, False),
+    ("partly_held", 18, TRIED, False),
 ]
 
 
@@ -32,8 +32,8 @@ def test_outcomes_in_files_are_frozen() -> None:
 
 
 def test_stages_are_ordered_and_frozen() -> None:
-    """Code compares stages with <: a lifted trial has everything that a closed one has."""
-    assert {s.name: s.value for s in Stage} == {"PLACED": 0, "CLOSED": 1, "LIFTED": 2}
+    """Code compares stages with <: a trial with a lift has everything that a closed one has."""
+    assert {s.name: s.value for s in Stage} == {"PLACED": 0, "CLOSED": 1, "TRIED": 2}
 
 
 def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:

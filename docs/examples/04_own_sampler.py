@@ -47,7 +47,7 @@ def main() -> None:
     for name, source, shift in (("normals", 1, -0.2), ("Above", 3, 0.2)):
         own = trials["outcome"][trials["source"] == source]
         counts = [np.count_nonzero(own == outcome) for outcome in outcomes]
-        print(f"{name}: {np.count_nonzero(own == dg.Outcome.SUCCESS)} of {len(own)} held")
+        print(f"{name}: {np.count_nonzero(own == dg.Outcome.SUCCESS)} of {len(own)} lifted")
         axes.barh(np.arange(len(outcomes)) + shift, counts, height=0.4, label=name)
     axes.set_yticks(range(len(outcomes)), [outcome.label for outcome in outcomes])
     axes.set(xlabel="attempts")

@@ -28,9 +28,9 @@ def main() -> None:
 
     # The epsilon of Ferrari and Canny: the smallest wrench that the contacts cannot resist.
     figure, axes = plt.subplots(figsize=(5.0, 2.6))
-    colours = ["tab:green" if verdict.held else "tab:red" for verdict in verdicts]
+    colours = ["tab:green" if verdict.lifted else "tab:red" for verdict in verdicts]
     axes.bar(range(len(verdicts)), [verdict.epsilon for verdict in verdicts], color=colours)
-    axes.set(xlabel="verified grasp (green: held)", ylabel="epsilon of the contacts")
+    axes.set(xlabel="verified grasp (green: lifted)", ylabel="epsilon of the contacts")
     axes.set_xticks(range(len(verdicts)))
     figure.tight_layout()
     figure.savefig("example/05_cluster.png")

@@ -26,7 +26,7 @@ def main() -> None:
     for split in ("train", "valid", "test"):
         data = dg.GraspDataset("example/dataset/grasping_oto.hdf5", split=split)
         names = sorted(set(data.column("object_props/object_name")))
-        f_Q_C = data.column("grasp_props/f_Q_C_held")  # (N, 3, 3) [N], a force per fingertip
+        f_Q_C = data.column("grasp_props/f_Q_C_lifted")  # (N, 3, 3) [N], a force per fingertip
         slip = data.column("grasp_props/slip")  # (N,) [m]
         force = np.linalg.norm(f_Q_C, axis=2).sum(axis=1)
         axes.plot(force, 1e3 * slip, "o", label=f"{split}: {', '.join(names)}")

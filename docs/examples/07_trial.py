@@ -37,14 +37,14 @@ def main() -> None:
         moved = posture.X_OG.copy()
         moved[1, 3] += offset
         trial = dg.run_trial(box, dg.Posture(moved, posture.q_grasp))
-        held = trial.outcome is dg.Outcome.SUCCESS
-        slips.append(1e3 * trial.lift.slip if held and trial.lift is not None else np.nan)
+        lifted = trial.outcome is dg.Outcome.SUCCESS
+        slips.append(1e3 * trial.lift.slip if lifted and trial.lift is not None else np.nan)
         print(f"{1e3 * offset:+4.0f} mm: {trial.outcome.label}")
 
     plt.figure(figsize=(5.0, 3.0))
     plt.plot(1e3 * offsets, slips, "o-")
     lost = np.isnan(slips)
-    plt.plot(1e3 * offsets[lost], np.zeros(lost.sum()), "x", color="tab:red", label="not held")
+    plt.plot(1e3 * offsets[lost], np.zeros(lost.sum()), "x", color="tab:red", label="not lifted")
     plt.xlabel("wrist off by [mm]")
     plt.ylabel("slip of the object in the hand [mm]")
     plt.legend() if lost.any() else None

@@ -29,7 +29,7 @@ KINDS = {
     "a cloud": ("units",),
     "a depth image": ("camera", "mask", "camera_pose", "depth_scale"),
 }
-#: Number of grasps for one object that are lifted if it is not given; scenes have many views.
+#: Number of grasps for one object that lifts try if it is not given; scenes have many views.
 SIMULATED = 5
 Metres: TypeAlias = Annotated[float, Parameter(metavar="METRES", validator=Number(gt=0.0))]
 
@@ -76,8 +76,8 @@ def predict(
     and a mask of one object.
 
     Grasps are proposed and ordered by closing the hand on the points. Then the first ones are
-    lifted in simulation on the object, completed from what was seen, until one holds in all its
-    lifts. The result also says if no grasp is likely to hold.
+    tried by lifts in simulation, on the object completed from what was seen, until one holds in all
+    its lifts. The result also says if no grasp is likely to hold.
 
     The grasps are written as a file of postures with a confidence each. `drakegrasp score` and
     `build --postures` take those of scenes. Those of a cloud are in the frame of the cloud, and
@@ -86,7 +86,7 @@ def predict(
     Args:
         source: Scenes, a cloud or a depth image.
         out: HDF5 file (.h5) to write.
-        simulate: Largest number of grasps of a view that are lifted; 0 for none. [default: 5 for
+        simulate: Largest number of grasps of a view that lifts try; 0 for none. [default: 5 for
             one object, 0 for scenes]
         count: Maximum number of grasps of a view. [default: all that are proposed]
         overrides: Change one setting of the preset fast, or for scenes of the dataset, e.g.

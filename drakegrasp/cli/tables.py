@@ -18,7 +18,7 @@ from drakegrasp.dataset.statistics import (
     SplitCount,
     count_funnel,
     count_splits,
-    held_note,
+    lifted_note,
 )
 from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
@@ -100,7 +100,7 @@ def funnel_table(funnel: Funnel) -> Table:
         "precision: successes that the fingertips alone hold; stable: precision, and the object "
         "moved by less than 5 mm and 5° in the hand",
         "distinct: samples whose palms are within 20 mm and 30° of each other count as one",
-        held_note(funnel),
+        lifted_note(funnel),
     ]
     caption = "\n".join(filter(None, notes))
     rows = ([name, *row(slice(i, i + 1))] for i, name in enumerate(funnel.names))

@@ -193,10 +193,10 @@ def _say_counts(results: Sequence[Verification]) -> None:
     total = f"of {counted(len(results), 'grasp')}"
     for outcome, count in Counter(result.outcome.label for result in results).most_common():
         say(f"{count:,} {total}: {outcome}", err=True)
-    words = ("held", "success", "precision", "stable", "sample", "held_any")
+    words = ("lifted", "matches", "precision", "stable", "kept", "lifted_any")
     counts = (f"{sum(getattr(each, word) for each in results):,} {word}" for word in words)
     say(f"verdicts: {', '.join(counts)}", err=True)
-    if best := [result.held for result in results if result.grasp.rank == 0]:
+    if best := [result.lifted for result in results if result.grasp.rank == 0]:
         say(f"{sum(best)} of {len(best)} best-ranked grasps hold", err=True)
     for hint, count in Counter(hint for each in results for hint in each.hints).most_common():
         say(f"{count} {total} would fit much better: {hint}", err=True)

@@ -581,10 +581,10 @@ def sample_values(
     X_CO = multiply(invert_pose(X_TC[camera]), X_TO)
     R_OC, p_CO = np.swapaxes(X_CO[:, :3, :3], 1, 2), X_CO[:, None, :3, 3]
 
-    # Grasp, palm and forces in the frame of the file's camera. The held grasp is expressed with the
-    # object in its resting pose: both grasps are transformed with X_CO.
+    # Grasp, palm and forces in the frame of the file's camera. The lifted grasp is expressed with
+    # the object in its resting pose: both grasps are transformed with X_CO.
     values: dict[str, AnyArray] = {}
-    for suffix, when, X_OG in (("", "closed", "X_OG"), ("_held", "lifted", "X_OG_lifted")):
+    for suffix, when, X_OG in (("", "closed", "X_OG"), ("_lifted", "lifted", "X_OG_lifted")):
         p_OQ, nhat_Q_O, f_Q_O = (trials[f"{when}_{n}"] for n in ("p_OQ", "nhat_Q_O", "f_Q_O"))
         vectors = multiply(p_OQ, R_OC) + p_CO, multiply(nhat_Q_O, R_OC)
         values[f"grasps{suffix}"] = np.concatenate(vectors, axis=1).reshape(trials.count, -1)

@@ -465,12 +465,12 @@ def _numbers(t: Table, task: _Rows) -> Iterator[Finding]:
 def _stage(t: Table, task: _Rows) -> AnyArray:
     """Return the stage (n,) that each row reached; a sample reached the last one."""
     if task.group != "trials":
-        return np.full(t.count, Stage.LIFTED.value)
+        return np.full(t.count, Stage.TRIED.value)
     stages = {outcome.value: outcome.stage.value for outcome in Outcome}
     reached = np.array([stages[outcome] for outcome in t["outcome"].tolist()], dtype=int)
     # The hand can touch the table while it closes, or in the lift.
     late = (t["outcome"] == Outcome.TABLE_CONTACT) & np.isfinite(t["time_lift"])
-    return np.where(late, Stage.LIFTED.value, reached)
+    return np.where(late, Stage.TRIED.value, reached)
 
 
 def _touching(t: Table, task: _Rows, field: Field) -> AnyArray:

@@ -13,7 +13,7 @@ see `PARTS`:
   supported by something else, or accelerates the object.
 * `normal_sum`: length of the sum of the unit normals after closing. Normals of opposed fingers
   cancel; if all fingers push in the same direction, the object escapes. On 1,023 lifts of 29
-  objects it separates failed lifts from held ones with an area under the ROC curve of 0.83.
+  objects it separates failed lifts from others with an area under the ROC curve of 0.83.
 
 Epsilon, the Ferrari-Canny measure, is not a part: as a threshold it would remove half of the true
 grasps.
@@ -57,7 +57,7 @@ class Part:
     scale: float
     shown: Shown
     meaning: str
-    stage: Stage = Stage.LIFTED
+    stage: Stage = Stage.TRIED
 
 
 def _shown(name: str) -> Shown:
@@ -140,8 +140,8 @@ def anomaly(columns: Mapping[str, npt.NDArray[Any]]) -> Anomaly:
         columns: Rows of `/trials` by the names of COLUMNS.
     """
     # How far each attempt got: each time has a value from its stage on.
-    closed, lifted = np.isfinite(columns["time_close"]), np.isfinite(columns["time_lift"])
-    reached = {Stage.CLOSED: closed, Stage.LIFTED: closed & lifted}
+    closed, tried = np.isfinite(columns["time_close"]), np.isfinite(columns["time_lift"])
+    reached = {Stage.CLOSED: closed, Stage.TRIED: closed & tried}
 
     # The value of each part, and the value divided by its scale.
     values = _values(columns)

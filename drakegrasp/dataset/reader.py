@@ -52,7 +52,7 @@ class Sample:
         mask: (S, S) uint8, 1 where the object is seen.
         grasp: (6k,) float32, contact points [m], then outward unit normals, in the camera frame,
             after closing.
-        grasp_held: (6k,) float32, the same for the contacts that hold the object after the lift,
+        grasp_lifted: (6k,) float32, the same for the contacts that hold the object after the lift,
             placed on the object in its resting pose.
         fingers: (k,) bool, fingers that the grasp uses; contacts of other fingers are NaN.
         trial_id: Row of /trials in trials.hdf5.
@@ -66,7 +66,7 @@ class Sample:
     image: npt.NDArray[np.float32]
     mask: npt.NDArray[np.uint8]
     grasp: npt.NDArray[np.float32]
-    grasp_held: npt.NDArray[np.float32]
+    grasp_lifted: npt.NDArray[np.float32]
     fingers: npt.NDArray[np.bool_]
     trial_id: int
     grasp_props: dict[str, Any]
@@ -170,7 +170,7 @@ class GraspDataset:
             image=values["images"],
             mask=values["masks"],
             grasp=values["grasps"],
-            grasp_held=values["grasps_held"],
+            grasp_lifted=values["grasps_lifted"],
             fingers=~unused_fingers(values["grasp_props/unused"], len(values["grasps"]) // 6),
             trial_id=int(values["trial_id"]),
             grasp_props=_group(values, "grasp_props/"),

@@ -44,11 +44,11 @@ from drakegrasp.vision.camera import DepthSensor, spoil_depth
 
 #: Frames of the grasps of a view.
 FRAMES = (Frame.TABLE, Frame.CAMERA)
-#: Which failed grasps are drawn: `tested`, hands that were lifted and lost the object; `closed`,
+#: Which failed grasps are drawn: `tested`, lifts that were tried and lost the object; `closed`,
 #: these and hands that closed without all fingertips on the object; `none`.
 Negatives = Literal["tested", "closed", "none"]
-#: Which grasps are drawn as good ones: samples, or all that held.
-Positives = Literal["sample", "held"]
+#: Which grasps are drawn as good ones: samples, or all that were lifted.
+Positives = Literal["kept", "lifted"]
 #: Whether each object is drawn equally often, or each view.
 Balance = Literal["object", "view"]
 #: Number of points cached for each view, as a multiple of the points of an item.
@@ -57,7 +57,7 @@ POOL = 2
 #: since few are then drawn twice.
 MANY = 8
 #: Labels by which grasps are counted.
-LABELS = ("tested", "held", "sample")
+LABELS = ("tested", "lifted", "kept")
 #: Streams of the pixels cached for a view, of the draws for an item, and of two kinds of orders.
 _VIEW, _ITEM, _ORDER, _ROUND = 0, 1, 2, 3
 
@@ -74,13 +74,13 @@ class SceneDataset:
     | `points` | (n, 3) float32 | what the camera sees of object and table, p_AP [m] |
     | `colours` | (n, 3) float32 | their R, G, B in 0..1 |
     | `on_object` | (n,) bool | whether they are on the object |
-    | `X_AG`, `X_AG_held` | (g, 4, 4) float32 | palm while closing, and after the lift [m] |
-    | `q_open`, `q`, `q_held` | (g, j) float32 | joints open, closed, after the lift [rad or m] |
+    | `X_AG`, `X_AG_lifted` | (g, 4, 4) float32 | palm while closing, and after the lift [m] |
+    | `q_open`, `q`, `q_lifted` | (g, j) float32 | joints open, closed, after the lift [rad or m] |
     | `p_AQ`, `nhat_Q_A` | (g, k, 3) float32 | contacts after closing [m], outward unit normals |
     | `f_Q_A` | (g, k, 3) float32 | forces of the fingertips after closing [N] |
-    | `p_AQ_held`, `nhat_Q_A_held`, `f_Q_A_held` | (g, k, 3) float32 | the same after the lift |
+    | `p_AQ_lifted`, `nhat_Q_A_lifted`, `f_Q_A_lifted` | (g, k, 3) float32 | after the lift |
     | `visible` | (g, k) bool | whether the camera sees the contact after closing |
-    | `held`, `sample`, `precision`, `stable`, `tested` | (g,) bool | labels, see the schema |
+    | `lifted`, `kept`, `precision`, `stable`, `tested` | (g,) bool | labels, see the schema |
     | `outcome` | (g,) uint8 | see `Outcome` |
     | `robust_kept`, `robust_tried` | (g,) int32 | k of n disturbed repeats, or 0 |
     | `trial_id` | (g,) int64 | row of trials.hdf5 |
@@ -91,8 +91,8 @@ class SceneDataset:
 
     With `points=None` an item has images instead of points: `rgb` (h, w, 3) uint8, `depth` (h, w)
     float32 [m], 0 for pixels without a depth, `mask` (h, w) uint8, 1 + index of the object, and the
-    camera matrix `K` (3, 3) float32 [px]. Values that end in `_held` are NaN for hands that were
-    not lifted, and contacts are NaN for fingers that do not touch.
+    camera matrix `K` (3, 3) float32 [px]. Values that end in `_lifted` are NaN for hands that were
+    not tried by a lift, and contacts are NaN for fingers that do not touch.
 
     Any number of forked or spawned processes may read; none keeps the file open. Each process
     caches points, or images, of the views that it has read. All draws depend only on seed, epoch
@@ -102,13 +102,13 @@ class SceneDataset:
         path: OUT/scenes.hdf5.
         points: Number n of points of an item; None for images.
         frame: `table` or `camera`.
-        negatives: Bad grasps to draw: `tested`, hands that were lifted and lost the object;
+        negatives: Bad grasps to draw: `tested`, lifts that were tried and lost the object;
             `closed`, also hands that closed without all fingertips on the object; `none`.
         balance: `object`, so that each object is drawn equally often; `view`, so that each view is.
         split: `train`, `valid` or `test`.
         grasps: Number g of grasps of an item. If a scene has fewer, some are repeated.
-        positives: Good grasps to draw: `sample`, or `held`, whatever the filters decided. A grasp
-            that is held and not a sample is never drawn as a bad one.
+        positives: Good grasps to draw: `kept`, or `lifted`, whatever the filters decided. A grasp
+            that is lifted and not a sample is never drawn as a bad one.
         on_object: Fraction of the points that are on the object, if enough of it is in the image.
         noise: Whether depths get the noise that was drawn for their view, if any was.
         objects: Names of the objects whose views are items; all if None.
@@ -142,7 +142,7 @@ class SceneDataset:
         balance: Balance = "object",
         split: str = "train",
         grasps: int = 8,
-        positives: Positives = "sample",
+        positives: Positives = "kept",
         on_object: float = 0.75,
         noise: bool = True,
         objects: Collection[str] | None = None,
@@ -299,7 +299,7 @@ class SceneDataset:
     def _choose(self, negatives: Negatives, positives: Positives) -> None:
         """Find the good and bad grasps of each scene."""
         grasps = self.tables["grasps"]
-        bad = grasps["tested"] & ~grasps["held"]
+        bad = grasps["tested"] & ~grasps["lifted"]
         if negatives == "closed":
             bad |= grasps["outcome"] == Outcome.MISSING_FINGERTIP
         if negatives == "none":
@@ -361,7 +361,7 @@ class SceneDataset:
         first = self._first_visible[view] - self._bounds[self._scene_of[view]]
         found = {key: grasps[key][rows] for key in _AS_STORED}
         found["visible"] = self._visible[first + rows]
-        for suffix in ("", "_held"):
+        for suffix in ("", "_lifted"):
             X_TG = unpack_pose(grasps[f"X_TG{suffix}"][rows])
             points, normals, forces = (
                 grasps[f"{name}{suffix}"][rows] for name in ("p_TQ", "nhat_Q_T", "f_Q_T")
@@ -507,7 +507,7 @@ class Rounds:
 
 #: Fields of /grasps that items contain unchanged.
 _AS_STORED = (
-    *("q_open", "q", "q_held", "held", "sample", "precision", "stable", "tested", "outcome"),
+    *("q_open", "q", "q_lifted", "lifted", "kept", "precision", "stable", "tested", "outcome"),
     *("robust_kept", "robust_tried", "trial_id"),
 )
 
@@ -520,7 +520,7 @@ def _validate_choice(name: str, value: object, known: tuple[str, ...]) -> None:
 Columns = dict[str, AnyArray]
 
 #: Outcomes of lifts to a verdict; a `table_contact` while closing is not one of these lifts.
-LIFTED = (Outcome.SUCCESS, *LOST, Outcome.TABLE_CONTACT)
+TRIED = (Outcome.SUCCESS, *LOST, Outcome.TABLE_CONTACT)
 #: Columns of /trials that /grasps copies, by their names in /grasps.
 _COPIED = {f.name: f.of for f in SCENE_GRASP_FIELDS if f.of} | {
     name: name for name in ("trial_id", "outcome", "precision", "stable", "preshape", "unused")
@@ -567,11 +567,11 @@ def grasps_of_trials(trials: Mapping[str, AnyArray], X_TO: Array, samples: AnyAr
     outcome, R_OT = trials["outcome"], np.swapaxes(X_TO[:, :3, :3], 1, 2)
     columns = {name: trials[of] for name, of in _COPIED.items()}
     columns |= {
-        "tested": np.isin(outcome, LIFTED) & np.isfinite(trials["time_lift"]),
-        "held": outcome == Outcome.SUCCESS,
-        "sample": samples,
+        "tested": np.isin(outcome, TRIED) & np.isfinite(trials["time_lift"]),
+        "lifted": outcome == Outcome.SUCCESS,
+        "kept": samples,
     }
-    for suffix, when, X_OG in (("", "closed", "X_OG"), ("_held", "lifted", "X_OG_lifted")):
+    for suffix, when, X_OG in (("", "closed", "X_OG"), ("_lifted", "lifted", "X_OG_lifted")):
         columns[f"X_TG{suffix}"] = pack_pose(multiply(X_TO, unpack_pose(trials[X_OG])))
         points, normals, forces = (trials[f"{when}_{n}"] for n in ("p_OQ", "nhat_Q_O", "f_Q_O"))
         columns[f"p_TQ{suffix}"] = multiply(points, R_OT) + X_TO[:, None, :3, 3]

@@ -52,7 +52,7 @@ CONVENTIONS = {
     "contacts": "pressure-weighted centre and mean normal of the hydroelastic patches between the "
     "pad of a fingertip and the object; a patch mostly beside the pad is split there, and its rest "
     "counts as another link",
-    "held": "at the end of the lift, relative to the object in its resting pose: everything that "
+    "lifted": "at the end of the lift, relative to the object in its resting pose: everything that "
     "moved with the object is moved back with it",
     "oto": "one-to-one: the camera is rolled with the palm",
     "otm": "one-to-many: image up is world up",
@@ -343,7 +343,7 @@ _SLIP = _measured(
 )
 _SLIP_USE = Field("slip_use", "float64",
                   "fraction of the friction cone in use after the lift; 1 at the border of the "
-                  "cone", "k", stage=Stage.LIFTED, per_finger=True, some=True, optional=True,
+                  "cone", "k", stage=Stage.TRIED, per_finger=True, some=True, optional=True,
                   derive=_friction_use, shown=Shown("friction in use", digits=2),
                   needs=("lifted_touching", "lifted_f_Q_O", "lifted_nhat_Q_O", "friction_hand"))
 _RELEASED = _measured(
@@ -392,7 +392,7 @@ CONDITION_FIELDS: tuple[Field, ...] = (
 #: How often a sample survives noise; see `simulation.attempt.disturbed`. Missing in files of builds
 #: without repeats, see `stored_fields`.
 ROBUST_FIELDS: tuple[Field, ...] = tuple(
-    replace(field, stage=Stage.LIFTED, some=True, optional=True)
+    replace(field, stage=Stage.TRIED, some=True, optional=True)
     for field in (
         Field("robust_tried", "int32", "number of disturbed repeats (section `robustness`) with "
               "a verdict; 0 for an attempt that was not selected"),
@@ -409,28 +409,28 @@ DATA_FIELDS: tuple[Field, ...] = (
           sample=True, limits=(0, 1)),
     Field("grasps", "float32", "contact points, then outward unit normals, after closing, in "
           "the frame of this file's camera", "6k", "m, -", "C"),
-    Field("grasps_held", "float32", "contact points and normals after the lift, relative to the "
+    Field("grasps_lifted", "float32", "contact points and normals after the lift, relative to the "
           "resting object", "6k", "m, -", "C"),
     Field("trial_id", "int64", "row of trials.hdf5"),
     *_copied("grasp_props", *_WORDS, *_LINEAGE, *_PRESHAPE),
     *_copied("grasp_props", *_SLIP, *_RELEASED, _SLIP_USE),
-    Field("grasp_props/other_links_held", "uint8", "number of other links of the hand that "
+    Field("grasp_props/other_links_lifted", "uint8", "number of other links of the hand that "
           "touch the object after the lift", of="lifted_other_links"),
     Field("grasp_props/X_CG", "float32", "pose of the palm at the start and while closing, in "
           "the frame of this file's camera", "12", "m, -", "C"),
-    Field("grasp_props/X_CG_held", "float32",
+    Field("grasp_props/X_CG_lifted", "float32",
           "pose of the palm after the lift, relative to the resting object", "12", "m, -", "C"),
     Field("grasp_props/q", "float32", "positions of the hand's joints after closing", "j",
           "rad or m", of="closed_q"),
-    Field("grasp_props/q_held", "float32", "positions of the hand's joints after the lift", "j",
+    Field("grasp_props/q_lifted", "float32", "positions of the hand's joints after the lift", "j",
           "rad or m", of="lifted_q"),
     Field("grasp_props/f_Q_C", "float32", "forces of the fingertips on the object after closing",
           "k 3", "N", "C"),
-    Field("grasp_props/f_Q_C_held", "float32", "forces of the fingertips on the object after "
+    Field("grasp_props/f_Q_C_lifted", "float32", "forces of the fingertips on the object after "
           "the lift, rotated with the object to its resting pose", "k 3", "N", "C"),
     Field("grasp_props/area", "float32", "areas of the contact patches after closing", "k", "m^2",
           of="closed_area"),
-    Field("grasp_props/area_held", "float32", "areas of the contact patches after the lift", "k",
+    Field("grasp_props/area_lifted", "float32", "areas of the contact patches after the lift", "k",
           "m^2", of="lifted_area"),
     *_copied("grasp_props", *ROBUST_FIELDS),
     # The mass is in object_props.
@@ -487,7 +487,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         *_CLOSED,
     ),
     *_since(
-        Stage.LIFTED,
+        Stage.TRIED,
         Field("surface_distance", "float64",
               "distance of the contact points after closing from the full mesh's surface", "k",
               "m", per_finger=True, of="fit.distance", shown=Shown("off surface", "mm", 2)),
@@ -558,17 +558,17 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "str", "name of the object", of="placed.model.name"),
     _verdict("outcome", [outcome for outcome in Outcome if not outcome.dataset_only]),
-    Field("success", "bool", "whether the first wrist pose holds, with each contact within "
-          "verify.max_contact_error of the requested contact", of="success"),
-    Field("held", "bool", "whether the first wrist pose holds, wherever the contacts are",
-          of="held"),
+    Field("matches", "bool", "whether the first wrist pose holds, with each contact within "
+          "verify.max_contact_error of the requested contact", of="matches"),
+    Field("lifted", "bool", "whether the first wrist pose holds, wherever the contacts are",
+          of="lifted"),
     *(replace(field, of=field.name) for field in _WORDS),
-    Field("sample", "bool", "whether the grasp passes the filters of a dataset, except filters "
-          "that need images or other grasps", of="sample"),
-    Field("removal", "uint8", f"first filter that removes a held grasp: {_labels(list(Removal))}",
-          stage=Stage.LIFTED, of="removal"),
-    Field("held_any", "bool",
-          "whether any of the tried wrist poses holds: the choice of an oracle", of="held_any"),
+    Field("kept", "bool", "whether the grasp passes the filters of a dataset, except filters "
+          "that need images or other grasps", of="kept"),
+    Field("removal", "uint8", f"first filter that removes a lifted grasp: {_labels(list(Removal))}",
+          stage=Stage.TRIED, of="removal"),
+    Field("lifted_any", "bool",
+          "whether any of the tried wrist poses holds: the choice of an oracle", of="lifted_any"),
     Field("confidence", "float64", "confidence that the file of the grasps states; NaN if it "
           "states none", of="grasp.confidence", shown=Shown("confidence", digits=3)),
     Field("rank", "int64",
@@ -621,7 +621,7 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
               per_finger=True, of="normal_error", shown=Shown("requested to reached normal", "°")),
     ),
     *_since(
-        Stage.LIFTED,
+        Stage.TRIED,
         _TIME_LIFT,
         *_LIFTED,
         Field("X_TO_lifted", "float64", "pose of the object after the lift, which starts at "
@@ -679,24 +679,25 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "int64", "row of trials.hdf5"),
     Field("outcome", "uint8", "verdict, see /trials"),
     Field("tested", "bool",
-          "whether the hand was lifted to a verdict; if not, it is unknown whether it would hold"),
-    Field("held", "bool", "whether the grasp holds"),
+          "whether a lift was tried to a verdict; if not, it is unknown whether it would hold"),
+    Field("lifted", "bool", "whether the grasp holds"),
     *_WORDS,
-    Field("sample", "bool", "whether the grasp is a sample of the dataset"),
+    Field("kept", "bool", "whether the grasp is a sample of the dataset"),
     Field("source", "uint8", "sampler of the palm pose, see /trials", of="source"),
     *(replace(field, of=field.name) for field in ROBUST_FIELDS),
     *_PRESHAPE,
     Field("X_TG", "float32", "pose of the palm at the start and while closing", "12", "m, -", "T"),
-    Field("X_TG_held", "float32", "pose of the palm after the lift, relative to the resting "
-          "object; NaN if not lifted", "12", "m, -", "T"),
+    Field("X_TG_lifted", "float32", "pose of the palm after the lift, relative to the resting "
+          "object; NaN if no lift was tried", "12", "m, -", "T"),
     replace(_JOINTS, name="q_open", dtype="float32", of="",
             meaning="positions of the hand's joints where it starts to close, fully open"),
     replace(_JOINTS, dtype="float32", of="closed_q",
             meaning="positions of the hand's joints after closing"),
-    replace(_JOINTS, name="q_held", dtype="float32", of="lifted_q",
-            meaning="positions of the hand's joints after the lift; NaN if not lifted"),
-    *(field for suffix, when in (("", "after closing"), ("_held", "after the lift, on the resting "
-                                                         "object; NaN if not lifted"))
+    replace(_JOINTS, name="q_lifted", dtype="float32", of="lifted_q",
+            meaning="positions of the hand's joints after the lift; NaN if no lift was tried"),
+    *(field for suffix, when in (("", "after closing"),
+                                 ("_lifted", "after the lift, on the resting object; NaN if no "
+                                  "lift was tried"))
       for field in (
         Field(f"p_TQ{suffix}", "float32", f"contact points {when}", "k 3", "m", "T",
               per_finger=True),

@@ -98,7 +98,7 @@ def count_funnel(out: Path) -> Funnel:
     trials = Trials(out)
     names, classes = (tuple(trials.objects[key].tolist()) for key in ("name", "class_name"))
     count, rows = len(names), Table(trials.columns(_COUNTED))
-    held = rows[rows.removal != NONE]
+    lifted = rows[rows.removal != NONE]
 
     # From where the palms of the samples approach.
     samples = _samples(trials)
@@ -113,7 +113,7 @@ def count_funnel(out: Path) -> Funnel:
         outcomes=_count((count, 1 + max(Outcome)), rows.object, rows.outcome),
         precision=_count((count,), rows.object[rows.precision]),
         stable=_count((count,), rows.object[rows.stable]),
-        removals=_count((count, 1 + max(Removal)), held.object, held.removal),
+        removals=_count((count, 1 + max(Removal)), lifted.object, lifted.removal),
         elevations=_count((count, len(BANDS)), own.objects, bands),
         approach_cells=_count((count,), cells[:, 0]),
     )
@@ -131,7 +131,7 @@ def _samples(trials: Trials) -> Table:
     Columns: `ids`, their trials; `objects`, rows of /objects; `X_TO` and `X_OG` (n, 4, 4), poses of
     object and palm before the hand closed; `distinct`, which of them are distinct grasps.
     """
-    kept = trials.where(sample=True)
+    kept = trials.where(kept=True)
     columns = kept.columns(("object", "resting", "X_TO", "X_OG"))
     X_TO, X_OG = (unpack_pose(columns[name]) for name in ("X_TO", "X_OG"))
     groups = np.column_stack([columns["object"], columns["resting"]])
@@ -149,14 +149,14 @@ def distinct_samples(trials: Trials) -> npt.NDArray[np.int64]:
     return samples.ids[samples.distinct]
 
 
-def held_note(funnel: Funnel) -> str:
-    """Return why there may be more held grasps than were counted; empty if there is no reason."""
+def lifted_note(funnel: Funnel) -> str:
+    """Return why there may be more lifted grasps than were counted; empty if there is no reason."""
     moved = int(funnel.outcomes[:, Outcome.MOVED].sum())
     if not moved:
         return ""
     ended = f"{counted(moved, 'lift')} ended early, without a verdict (moved)"
     why = "because the object moved more in the hand than a sample may"
-    return f"the number of held grasps is a lower bound: {ended}, {why}"
+    return f"the number of lifted grasps is a lower bound: {ended}, {why}"
 
 
 def count_splits(out: Path) -> list[SplitCount]:
@@ -166,7 +166,7 @@ def count_splits(out: Path) -> list[SplitCount]:
         DataError: If a file is missing or damaged.
     """
     trials = Trials(out)
-    samples, counts = trials.where(sample=True), list[SplitCount]()
+    samples, counts = trials.where(kept=True), list[SplitCount]()
     columns = samples.columns(("split", "object", "class_name"))
     distinct = np.isin(samples.trial_ids, distinct_samples(trials))
     for i, split in enumerate(SPLITS):

@@ -1,4 +1,4 @@
-"""Successes: what filters and splits need of each grasp that held, and why it is no sample.
+"""Successes: what filters and splits need of each lifted grasp, and why it is no sample.
 
 Input: rows of `/trials` and `/looks`. Output: a table with the identity of each attempt, columns of
 its rows, and columns that follow from them. From it follows the `Removal` of each: by our filters,
@@ -80,7 +80,7 @@ def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
         unused=unused,
         complete=np.all(touching | unused, axis=1),
         grasp_T=_packed(p_TQ, nhat_Q_T),
-        held_O=_packed(t["lifted_p_OQ"], t["lifted_nhat_Q_O"]),
+        lifted_O=_packed(t["lifted_p_OQ"], t["lifted_nhat_Q_O"]),
         other_links=t["lifted_other_links"],
         surface_distance=_largest(t["surface_distance"], unused),
         normal_angle=_largest(t["normal_angle"], unused),

@@ -1,7 +1,7 @@
 """Reading the attempts of a dataset, whatever their outcome. Imports only h5py and NumPy.
 
->>> held = Trials("OUT").where(outcome="success", object_name="mug")   # doctest: +SKIP
->>> held["slip"].max(), held.contacts(frame="table").points.shape      # doctest: +SKIP
+>>> lifted = Trials("OUT").where(outcome="success", object_name="mug")   # doctest: +SKIP
+>>> lifted["slip"].max(), lifted.contacts(frame="table").points.shape  # doctest: +SKIP
 (0.0093, (27, 3, 3))
 """
 
@@ -155,7 +155,7 @@ class Trials:
         outcome: Outcome | str | Sequence[Outcome | str] | None = None,
         object_name: str | None = None,
         class_name: str | None = None,
-        sample: bool | None = None,
+        kept: bool | None = None,
     ) -> Trials:
         """Return the attempts that meet all given conditions.
 
@@ -163,7 +163,7 @@ class Trials:
             outcome: One or several outcomes, as `Outcome` or by their labels, e.g. "success".
             object_name: Name of the object.
             class_name: Name of the object's class.
-            sample: Whether the attempt is a sample of the dataset.
+            kept: Whether the attempt is a sample of the dataset.
 
         Raises:
             DataError: If there is no such outcome, object or class.
@@ -179,8 +179,8 @@ class Trials:
                 if not own.any():
                     raise DataError(f"{key} must be one of the dataset's, got {name!r}")
                 mask &= own[self["object"]]
-        if sample is not None:
-            mask &= (self["removal"] == Removal.KEPT) == sample
+        if kept is not None:
+            mask &= (self["removal"] == Removal.KEPT) == kept
         return self[mask]
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, AnyArray]:

@@ -150,7 +150,7 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
         DataError: If a file of the dataset is missing or belongs to another dataset, or a sample
             has a number that is not finite.
     """
-    kept = Trials(out).where(sample=True)
+    kept = Trials(out).where(kept=True)
     names = ("object_name", "split", "X_TO", "X_OG", "closed_q", "spread", "unused", "preshape")
     samples, rows = kept.columns((*names, *CONDITIONS)), kept.trial_ids
     if not np.isin(samples["split"], range(len(SPLITS))).all():

@@ -43,7 +43,7 @@ HELP = "Parquet, as the Hugging Face Hub has it; needs pip install 'drakegrasp[h
 FILE_ROWS, GROUP_ROWS = 2000, 100
 #: Columns that hold PNG files.
 IMAGES = ("image", "depth", "mask")
-_NAMES = {"grasps": "grasp", "grasps_held": "grasp_held"}
+_NAMES = {"grasps": "grasp", "grasps_lifted": "grasp_lifted"}
 #: Fields by the names of columns that are no images.
 COLUMNS: Mapping[str, Field] = {
     _NAMES.get(field.name, field.name.rpartition("/")[2]): field

@@ -194,7 +194,7 @@ class TrialRow(NamedTuple):
         attempt: The attempt.
         conditions: Friction, mass, appearance and cameras of the attempt.
         trial: The record of the trial.
-        fit: Fit of the contacts after closing to the surface; None if the hand was not lifted.
+        fit: Fit of the contacts after closing to the surface; None if no lift was tried.
     """
 
     attempt: Attempt
@@ -240,7 +240,7 @@ def _trial_rows(
 
 
 def _fit(model: ObjectModel, record: TrialRecord) -> ContactFit | None:
-    """Return the fit of the contacts after closing to the mesh; None if the hand was not lifted."""
+    """Return the fit of the contacts after closing to the mesh; None if no lift was tried."""
     if record.closed is None or record.lift is None:
         return None
     closed = record.closed.contacts
@@ -284,7 +284,7 @@ def _seen(setup: TrialSetup, attempt: Attempt, X_TO: Array, name: str) -> dict[s
 def judge_sample(
     model: ObjectModel, trial: TrialRecord, config: Config, *, views: bool = True
 ) -> Removal | None:
-    """Return the first filter that removes a held grasp, or `KEPT` if none does.
+    """Return the first filter that removes a lifted grasp, or `KEPT` if none does.
 
     The cameras have the poses of a build without randomisation.
 

@@ -291,7 +291,7 @@ PAGES: dict[str, Answer] = {
 def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
     table, decision = inspection.table(AttemptGallery), content.get("decision")
     i = table.find(str(content.get("label")))
-    if i is None or not table.table.held[i]:
+    if i is None or not table.table.lifted[i]:
         raise HTTPException(404, "the attempt must be a success of the dataset")
     if decision not in ("rejected", ""):
         raise HTTPException(400, f"decision must be rejected or empty, got {decision!r}")

@@ -55,7 +55,7 @@ class AttemptGallery(Gallery):
     CHOICES: ClassVar = {
         "outcome": ("any", *(outcome.label for outcome in Outcome)),
         "split": ("samples", *SPLITS, "none"),
-        "hold": ("held", "precision", "stable"),
+        "hold": ("lifted", "precision", "stable"),
         "removal": tuple(removal.label for removal in Removal),
         "decision": ("rejected", "open"),
     }
@@ -80,7 +80,7 @@ class AttemptGallery(Gallery):
         """Return which attempts (n,) match a value of the filter `name`."""
         if name == "decision":
             rejected = self._rejected()
-            return rejected if value == "rejected" else self.table.held & ~rejected
+            return rejected if value == "rejected" else self.table.lifted & ~rejected
         if name == "split" and value in SPLIT_NAMES:
             return np.asarray((self.table.split == NONE) == (value == "none"))
         return super().matches(name, value)
@@ -199,8 +199,9 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
     """Return words about an attempt: how it holds, and its split or why it is not a sample."""
     table = snapshot.table
     words = []
-    if table.held[i]:
-        words.append("stable" if table.stable[i] else "precision" if table.precision[i] else "held")
+    if table.lifted[i]:
+        still = "precision" if table.precision[i] else "lifted"
+        words.append("stable" if table.stable[i] else still)
     if table.outcome[i] == Outcome.MOVED:
         words.append("lift ended, not judged")
     if table.split[i] != NONE:

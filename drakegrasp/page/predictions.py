@@ -65,9 +65,9 @@ QUANTITIES = {
 }
 #: Quantities on cards.
 _CARD = ("contact_error", "true_error", "slip", "turn", "confidence")
-#: Words of a verdict on a held grasp; and all words, for filtering.
-WORDS = ("held", "success", "precision", "stable", "sample")
-VERDICTS = ("fails", *WORDS, "held_any")
+#: Words of a verdict on a lifted grasp; and all words, for filtering.
+WORDS = ("lifted", "matches", "precision", "stable", "kept")
+VERDICTS = ("fails", *WORDS, "lifted_any")
 #: Kinds of contacts, and the columns of a verdict that contain them.
 _CONTACTS = {"requested": ("p_OQ", "nhat_Q_O"), "reached": ("closed_p_OQ", "closed_nhat_Q_O")}
 #: The largest force of a fingertip.
@@ -112,11 +112,11 @@ class Predictions(Gallery):
             self._columns = {name: _column(group, field) for name, field in FIELDS.items()}
 
         # The largest value of the contacts; different hands may have different numbers of fingers.
-        columns, held = dict(self._columns), outcome == Outcome.SUCCESS
+        columns, lifted = dict(self._columns), outcome == Outcome.SUCCESS
         self._places = self.rows.trial_id
         true, p_OQ = snapshot.trials[self._places.tolist()]["closed_p_OQ"], columns["p_OQ"]
         columns["true_error"] = norm(p_OQ - true) if p_OQ.shape == true.shape else None
-        largest = {name: _largest(columns[name], len(held)) for name in QUANTITIES}
+        largest = {name: _largest(columns[name], len(lifted)) for name in QUANTITIES}
         words = {name: columns[name] for name in VERDICTS if columns.get(name) is not None}
 
         # The worst predictions are those that fail, and among these those whose hand reached no
@@ -124,12 +124,12 @@ class Predictions(Gallery):
         error = largest["contact_error"]
         share = np.where(np.isnan(error), 1.0, error / (1.0 + error))
         self.table = Table(
-            largest | {name: values for name, values in words.items() if name != "held"},
+            largest | {name: values for name, values in words.items() if name != "lifted"},
             object=snapshot.table.object[self._places],
             outcome=outcome,
-            fails=~held,
-            held=held,
-            worst=np.where(held, share, 2.0 + share),
+            fails=~lifted,
+            lifted=lifted,
+            worst=np.where(lifted, share, 2.0 + share),
             row=self.rows.row,
         )
 
@@ -152,7 +152,7 @@ class Predictions(Gallery):
             "dataset": out.name or str(out),
             "split": self.rows.split,
             "rows": len(np.unique(self.rows.row)),
-            "held": int(np.count_nonzero(self.table.held[chosen])),
+            "lifted": int(np.count_nonzero(self.table.lifted[chosen])),
         }
 
     def cards(self, shown: Places) -> list[dict[str, Any]]:
@@ -205,9 +205,9 @@ class Predictions(Gallery):
     def _verdict(self, i: int) -> list[tuple[str, str]]:
         """Return the words of a verdict, each with its style class."""
         words = {word for word in VERDICTS if word in self.table and self.table[word][i]}
-        if "held" in words:
-            return [("held", word) for word in WORDS if word in words]
-        by_another = [("", "held by another wrist pose")] if "held_any" in words else []
+        if "lifted" in words:
+            return [("lifted", word) for word in WORDS if word in words]
+        by_another = [("", "lifted by another wrist pose")] if "lifted_any" in words else []
         return [("failed", _outcome(self.table.outcome[i])), *by_another]
 
     def _marks(

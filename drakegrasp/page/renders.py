@@ -2,7 +2,7 @@
 
 Input: attempts, which are read from the files when requested, and the hand. The 3D view consists of
 plain lists for JSON. Everything in it is in {T}, with the object in its resting pose: lifted hands
-are moved back with the object, as in the dataset's `_held` fields, so that a slip in the hand is
+are moved back with the object, as in the dataset's `_lifted` fields, so that a slip in the hand is
 visible as a different pose of the hand.
 """
 

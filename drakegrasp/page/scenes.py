@@ -27,7 +27,7 @@ PALMS, HANDS = 100, 8
 PALM = 0.06
 #: Display of a grasp by its labels: the word, its style class, and the colour of its palm.
 HOLDS, FAILS, UNKNOWN = (
-    ("holds", "held", TRUE),
+    ("holds", "lifted", TRUE),
     ("fails", "failed", REACHED),
     ("not tested", "", "#F0E442"),
 )
@@ -48,8 +48,8 @@ class Scenes(Gallery):
     CHOICES: ClassVar = {"split": SPLITS}
     SELECTS: ClassVar = {name: name for name in ("class", "object", "split")}
     SORTS: ClassVar = {
-        "sample": "samples",
-        "held": "grasps that hold",
+        "kept": "samples",
+        "lifted": "grasps that hold",
         "tested": "tested grasps",
         "grasps": "grasps",
         "row": "row of the file",
@@ -67,8 +67,8 @@ class Scenes(Gallery):
         if others := set(data.names) - set(snapshot.names):
             raise DataError(f"{path}: must be of objects of {snapshot.out}, got {min(others)}")
 
-        # Numbers of grasps in each scene, of tested and held ones, of samples, and of views.
-        of = {name: grasps["scene"][grasps[name]] for name in ("sample", "held", "tested")}
+        # Numbers of grasps in each scene, of tested and lifted ones, of samples, and of views.
+        of = {name: grasps["scene"][grasps[name]] for name in ("kept", "lifted", "tested")}
         of |= {"grasps": grasps["scene"], "views": views["scene"]}
         numbers = np.array([snapshot.names.index(name) for name in data.names], dtype=np.int32)
         self.snapshot, self.data = snapshot, data
@@ -84,10 +84,10 @@ class Scenes(Gallery):
         return np.flatnonzero(self.data.tables["views"]["scene"] == scene)
 
     def grasps(self, scene: int) -> Rows:
-        """Return the rows of a scene's grasps: samples, then other held ones, failed, untested."""
+        """Return the rows of a scene's grasps: samples, other lifted ones, failed, untested."""
         grasps, rows = self.data.tables["grasps"], self.data.rows_in(scene)
-        sample, held, tested = (grasps[name][rows] for name in ("sample", "held", "tested"))
-        return rows[np.argsort(-(4 * sample + 2 * held + 1 * tested), kind="stable")]
+        kept, lifted, tested = (grasps[name][rows] for name in ("kept", "lifted", "tested"))
+        return rows[np.argsort(-(4 * kept + 2 * lifted + 1 * tested), kind="stable")]
 
     # Contents of pages.
 
@@ -126,8 +126,8 @@ class Scenes(Gallery):
 
     def _drawn(self, i: int) -> int | None:
         """Return the row of the grasp drawn into the views: the best one, or None if it fails."""
-        grasps, held = self.grasps(i), self.data.tables["grasps"]["held"]
-        return int(grasps[0]) if len(grasps) and held[grasps[0]] else None
+        grasps, lifted = self.grasps(i), self.data.tables["grasps"]["lifted"]
+        return int(grasps[0]) if len(grasps) and lifted[grasps[0]] else None
 
     def _seen(self, i: int, k: int, drawn: int | None) -> dict[str, Any]:
         """Return the k-th view of a scene, and where it sees a grasp's palm and contacts."""
@@ -160,7 +160,7 @@ class Scenes(Gallery):
     def _holds(self, row: int) -> tuple[str, str, str]:
         """Return the display of a grasp by its labels: HOLDS, FAILS or UNKNOWN."""
         table = self.data.tables["grasps"]
-        if table["held"][row]:
+        if table["lifted"][row]:
             return HOLDS
         return FAILS if table["tested"][row] else UNKNOWN
 

@@ -47,7 +47,7 @@ _KEPT: dict[str, type[np.generic]] = {
 def read_attempts(trials: Trials) -> Table:
     """Return the columns of attempts for memory (n,), in the order of the dataset's rows.
 
-    They are those of _KEPT, `held`, and FEATURES as float32, NaN if an attempt ended before, and
+    They are those of _KEPT, `lifted`, and FEATURES as float32, NaN if an attempt ended before, and
     infinite if a contact has no normal. `removal` is NONE for an attempt that is not a success,
     `split` is NONE for one that is not a sample.
 
@@ -75,7 +75,7 @@ def _columns_of(columns: Mapping[str, AnyArray]) -> Table:
     for name, values in found.items():
         features[name][closed] = values
     kept = {name: columns[name].astype(dtype) for name, dtype in _KEPT.items()}
-    return Table(kept | features, held=kept["outcome"] == Outcome.SUCCESS)
+    return Table(kept | features, lifted=kept["outcome"] == Outcome.SUCCESS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,7 +110,7 @@ class Snapshot:
     @cached_property
     def _successes(self) -> dict[tuple[int, ...], int]:
         """The rows of the successes by their identities."""
-        rows = np.flatnonzero(self.table.held).tolist()
+        rows = np.flatnonzero(self.table.lifted).tolist()
         identities = zip(*(self.table[name][rows].tolist() for name in IDENTITY), strict=True)
         return dict(zip(identities, rows, strict=True))
 

@@ -159,14 +159,14 @@ def _colours(card: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]) -> None:
-    """Draw the headline of each set with its interval, and a tick for what is held anywhere."""
+    """Draw the headline of each set with its interval, and a tick for what is lifted anywhere."""
     for i, (name, each) in enumerate(card["sets"].items()):
         value, low, high = (100.0 * each["measures"]["headline"][k] for k in _ENDS)
         axes.plot([low, high], [i, i], color=colours[name], linewidth=2.2, solid_capstyle="round")
         axes.plot(value, i, "o", color=colours[name], markersize=7)
-        if "held" in card["measures"]:
-            held = 100.0 * each["measures"]["held"]["value"]
-            axes.plot(held, i, "|", color=colours[name], markersize=11, markeredgewidth=1.4)
+        if "lifted" in card["measures"]:
+            lifted = 100.0 * each["measures"]["lifted"]["value"]
+            axes.plot(lifted, i, "|", color=colours[name], markersize=11, markeredgewidth=1.4)
 
     # The names of the sets, in their colours.
     axes.set_yticks(range(len(card["sets"])), [shortened(name, LONGEST) for name in card["sets"]])
@@ -177,7 +177,7 @@ def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, st
     axes.grid(axis="x", color="#E3E6EA")
     axes.set_xlabel("per cent of rows, mean over objects")
     protocol = card["settings"].get("protocol")
-    title = f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)"
+    title = f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: lifted anywhere)"
     if protocol is not None:
         title = f"Success by {protocol['protocol']}, 95 % interval"
     axes.set_title(title)
@@ -187,9 +187,9 @@ _ENDS = ("value", "low", "high")
 
 
 def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]) -> None:
-    """Draw held(d) of each set, in the colour of its name in the first panel."""
+    """Draw lifted(d) of each set, in the colour of its name in the first panel."""
     for name, each in card["sets"].items():
-        curve = each["held_within_mm"]
+        curve = each["lifted_within_mm"]
         values = [100.0 * share for share in curve.values()]
         wide = 2.4 if name in card["headline"] else 1.5
         limits = [float(d) for d in curve]
@@ -199,7 +199,7 @@ def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]
     axes.set_ylim(-2.0, 102.0)
     axes.grid(color="#E3E6EA")
     axes.set_xlabel("d: largest distance from a requested contact [mm]")
-    axes.set_title("held(d) [%]")
+    axes.set_title("lifted(d) [%]")
 
 
 def _draw_calibration(

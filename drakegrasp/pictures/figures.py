@@ -141,7 +141,7 @@ def read_samples(out: Path) -> Samples:
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
     """
-    samples = Trials(out).where(sample=True)
+    samples = Trials(out).where(kept=True)
     columns = samples.columns(COLUMNS)
 
     degrees = np.rad2deg(1.0)

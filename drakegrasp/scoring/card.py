@@ -46,14 +46,14 @@ BY_PROTOCOL = {
 }
 #: Meanings of the measures, in the order of a table.
 MEANINGS = {
-    "headline": "a sample, held by the first wrist pose with every contact within d; best-ranked "
+    "headline": "a sample, lifted by the first wrist pose with every contact within d; best-ranked "
     "prediction of each row; mean over objects",
-    "success": "held by the first wrist pose with every contact within d",
-    "sample": "all rules of a sample, wherever the fingertips touch",
-    "held": "held by the first wrist pose, wherever the fingertips touch",
-    "precision": "held by the fingertips alone",
+    "matches": "lifted by the first wrist pose with every contact within d",
+    "kept": "all rules of a sample, wherever the fingertips touch",
+    "lifted": "lifted by the first wrist pose, wherever the fingertips touch",
+    "precision": "lifted by the fingertips alone",
     "stable": "a precision grasp that moves less than 5 mm and 5 degrees",
-    "held_any": "any of at most five wrist poses holds: an oracle chose among them",
+    "lifted_any": "any of at most five wrist poses holds: an oracle chose among them",
     "objects": "objects with a row that counts in the headline",
 }
 
@@ -89,7 +89,7 @@ def card_of(
     described = {each.name: _set_of(each, grouping, draws, oracle) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
     by_protocol = "protocol" in settings
-    measures = {k: v for k, v in MEANINGS.items() if k != "held_any" or oracle}
+    measures = {k: v for k, v in MEANINGS.items() if k != "lifted_any" or oracle}
 
     card: dict[str, Any] = {
         "form": FORM,
@@ -152,7 +152,7 @@ def _set_of(
         "files": [{"name": r.file, "sha256": r.sha256} for r in judged.ranked],
         "predictions": table.count,
         "measures": estimates(judged, grouping, draws, oracle=oracle),
-        "held_within_mm": dict(zip(map(str, CURVE_MM), curve(judged, grouping), strict=True)),
+        "lifted_within_mm": dict(zip(map(str, CURVE_MM), curve(judged, grouping), strict=True)),
         "penetration": penetration(judged),
         "diversity": diversity(judged),
         "calibration": calibration(judged),
@@ -239,10 +239,10 @@ def _more(card: Mapping[str, Any]) -> list[str]:
     # The curve, and measures of the predictions that count.
     sets, lines = card["sets"], list[str]()
     if "protocol" not in card["settings"]:
-        curves = [each["held_within_mm"] for each in sets.values()]
+        curves = [each["lifted_within_mm"] for each in sets.values()]
         rows = [[d, *(_percent(each[d]) for each in curves)] for d in map(str, CURVE_MM)]
-        words = "Held with every contact within d of the requested one [%]."
-        lines += ["## held(d)", "", words, "", *_table(["d [mm]", *sets], rows)]
+        words = "Lifted with every contact within d of the requested one [%]."
+        lines += ["## lifted(d)", "", words, "", *_table(["d [mm]", *sets], rows)]
     rows = []
     for name, each in sets.items():
         depth = "-" if each["penetration"] is None else f"{1e3 * each['penetration']:.2f}"

@@ -67,14 +67,14 @@ def _estimate(value: float, resampled: Array) -> Estimate:
 
 #: Numbers of predictions per row for which success is reported.
 KS = (1, 2, 5, 10, 20, 50, 100)
-#: Distances d between requested and reached contacts of the curve held(d) [mm].
+#: Distances d between requested and reached contacts of the curve lifted(d) [mm].
 CURVE_MM = tuple(range(0, 61, 5))
 #: Number of groups of equal size into which predictions are sorted by their stated confidence.
 BINS = 5
 #: Number of components of the diversity, as in DexGraspBench.
 COMPONENTS = 5
 #: Measures of a row's best-ranked prediction.
-FIRST = ("headline", "success", "sample", "held", "precision", "stable", "held_any")
+FIRST = ("headline", "matches", "kept", "lifted", "precision", "stable", "lifted_any")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -165,7 +165,7 @@ def estimates(
     """
     table, by_row = judged.table, dict[str, Array]()
     for name in FIRST:
-        if name != "held_any" or oracle:
+        if name != "lifted_any" or oracle:
             by_row[name] = grouping.best_of_rows(judged, table[name])
     for k in KS:
         if 1 < k <= int(table.rank.max()) + 1:
@@ -194,10 +194,10 @@ def _headlines(judged: Judged, grouping: Grouping) -> Array:
 
 
 def curve(judged: Judged, grouping: Grouping) -> list[float]:
-    """Return held(d) at `CURVE_MM`: held, with every contact within d of the requested one."""
+    """Return lifted(d) at `CURVE_MM`: lifted, with every contact within d of the requested one."""
     table, values = judged.table, []
     for limit in CURVE_MM:
-        within = table.held & (table.contact_error <= 1e-3 * limit)
+        within = table.lifted & (table.contact_error <= 1e-3 * limit)
         values.append(_rounded(grouping.means(grouping.best_of_rows(judged, within)).mean()))
     return values
 

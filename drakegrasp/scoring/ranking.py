@@ -5,9 +5,9 @@ Input: grasps that anybody proposes, and an object's visible points in {T}, wher
 solids (`mesh.cloud`), and the hand's geometry determines where each finger stops
 (`simulation.closing`). A score is a mean over the solids and over small moves of the palm.
 
-If the caller asks for it, the first grasps are also lifted in simulation, which decides better than
-geometry: on the object completed from both solids, with or without the view that shows it
-(`vision.depth_image`). If one of these lifts is a sample, the grasp is also lifted with the palm
+If the caller asks for it, the first grasps are also tried by lifts in simulation, which decide
+better than geometry: on the object completed from both solids, with or without the view that shows
+it (`vision.depth_image`). If one of these lifts is a sample, the grasp is also tried with the palm
 aside and with less friction. Mass, friction and filters are those of the configuration.
 """
 
@@ -85,10 +85,10 @@ class Ranking:
             `robust` (n,), fraction in which the open hand is free and all required pads touch.
         chance: (n,), chance that the grasp would be a sample of a dataset; 0 for a row that is not
             a posture. It was fitted for the Barrett Hand; for another hand it is an order only.
-        share: (n,), share of the lifts that end as a sample; NaN if the grasp was not lifted.
+        share: (n,), share of the lifts that end as a sample; NaN if no lift was tried.
         height: Height of the highest point above the table [m].
-        completion: What was lifted: "view", solids from which the free space of a view is cut,
-            "cloud", solids without a view, or empty if nothing was lifted.
+        completion: On what lifts were tried: "view", solids from which the free space of a view is
+            cut, "cloud", solids without a view, or empty if no lift was tried.
     """
 
     score: Array
@@ -106,9 +106,9 @@ class Ranking:
 
     def explain(self) -> str:
         """Return in a sentence what to expect of the first grasp."""
-        lifted = int(np.isfinite(self.share).sum())
+        tried = int(np.isfinite(self.share).sum())
         where = f"on the object completed from the {self.completion}"
-        how = f"{lifted} lifted {where}" if lifted else "none was lifted"
+        how = f"{tried} tried {where}" if tried else "no lift was tried"
         chance = f"is a sample with a chance of {self.chance[self.order[0]]:.0%} ({how})"
         if self.likely:
             return f"the first grasp {chance}"
@@ -138,7 +138,7 @@ def rank(
         hand: A hand, or an argument of `load_hand`; None for the hand of `config`, or else the
             default hand.
         spread: Spread of palm poses [rad].
-        simulate: Largest number of proposals that are lifted on the completed object, in the order
+        simulate: Largest number of proposals that are tried on the completed object, in the order
             of their scores, until all lifts of one are samples; 0 for none.
         view: Depth image (h, w) [m], mask (h, w), camera matrix K (3, 3) [px] and camera pose X_TC
             (4, 4) of the cloud, as in `cloud_from_depth`. They show what beside the object is
@@ -333,7 +333,7 @@ def place_completed(
 def lift_shares(completed: Sequence[PlacedObject], starts: Sequence[Attempt]) -> Array:
     """Return the share (n,) of the lifts of each grasp that end as a sample.
 
-    The first grasp all of whose lifts are samples is the last one that is lifted; the rest is NaN.
+    The first grasp all of whose lifts are samples is the last one that is tried; the rest is NaN.
 
     Args:
         completed: The completed objects; the further lifts are on the first one.
@@ -379,7 +379,7 @@ def chances(score: Array, share: Array) -> Array:
     Args:
         score: (n,), scores by closing.
         share: (n,), shares of their lifts that are samples on the completed object; NaN for a grasp
-            that was not lifted.
+            that was not tried by a lift.
     """
     constant, of_score = WITHOUT_LIFTS
     logit = constant + of_score * score

@@ -139,13 +139,13 @@ _DIGITS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """The verdict on one prediction. All but `held_any` is about the first wrist pose.
+    """The verdict on one prediction. All but `lifted_any` is about the first wrist pose.
 
     Attributes:
         outcome: Name of the outcome.
-        held, precision, stable, sample: As in a dataset, wherever the fingertips touch.
-        success: Held, with every contact within `verify.max_contact_error` of the requested one.
-        held_any: Whether any of at most five wrist poses holds: an oracle chose among them.
+        lifted, precision, stable, kept: As in a dataset, wherever the fingertips touch.
+        matches: Lifted, with every contact within `verify.max_contact_error` of the requested one.
+        lifted_any: Whether any of at most five wrist poses holds: an oracle chose among them.
         contact_error: Largest distance between requested and reached contacts [m]; None if a
             fingertip did not touch; 0 for a posture that holds, because it requests no contacts.
         penetration: Largest penetration after closing [m]; None if the hand did not close.
@@ -156,12 +156,12 @@ class Verdict:
     """
 
     outcome: str
-    success: bool
-    held: bool
+    matches: bool
+    lifted: bool
     precision: bool
     stable: bool
-    sample: bool
-    held_any: bool
+    kept: bool
+    lifted_any: bool
     contact_error: float | None
     penetration: float | None
     posture: tuple[float, ...]
@@ -171,23 +171,23 @@ class Verdict:
     @property
     def counted(self) -> bool:
         """Whether it counts in the headline: a sample that is made by the requested contacts."""
-        return self.success and self.sample
+        return self.matches and self.kept
 
 
 def verdict_of(result: Verification) -> Verdict:
     """Return the part of a verification that a score stores."""
     first, farthest = result.first, result.farthest_contact
     closed = None if first is None else first.trial.closed
-    if result.grasp.postures and result.held:
+    if result.grasp.postures and result.lifted:
         farthest = 0.0
     return Verdict(
         outcome=result.outcome.label,
-        success=result.success,
-        held=result.held,
+        matches=result.matches,
+        lifted=result.lifted,
         precision=result.precision,
         stable=result.stable,
-        sample=result.sample,
-        held_any=result.held_any,
+        kept=result.kept,
+        lifted_any=result.lifted_any,
         contact_error=_rounded(farthest) if math.isfinite(farthest) else None,
         penetration=None if closed is None else _rounded(np.nanmax(closed.contacts.penetration)),
         posture=() if closed is None or first is None else _posture(first.trial.X_OG, closed.q),
@@ -202,7 +202,7 @@ def protocol_verdict(found: PostureVerdict) -> Verdict:
     A protocol only decides on success, which is then used for all measures.
     """
     outcome = found.reason.partition(":")[0] or "success"
-    measures = ("success", "held", "precision", "stable", "sample", "held_any")
+    measures = ("matches", "lifted", "precision", "stable", "kept", "lifted_any")
     return Verdict(
         outcome=outcome,
         **dict.fromkeys(measures, found.success),

@@ -126,12 +126,12 @@ def repeat_disturbed(
 ) -> list[TrialRecord]:
     """Return the records of disturbed repeats; inconclusive repeats are left out.
 
-    Repeats use the time step of the trial and are lifted to the end. The stored trial is not one.
+    Repeats use the time step of the trial and whole lifts. The stored trial is not one.
 
     Args:
         model: The object.
         X_TO: Resting pose of the object, (4, 4).
-        attempt: A lifted attempt; the noise is relative to its friction and mass.
+        attempt: An attempt with a lift; the noise is relative to its friction and mass.
         config: The rules; `robustness` has the number of repeats.
     """
     # Whether a grasp holds is decided by a whole lift.

@@ -93,9 +93,9 @@ class TrialRecord:
 
     @property
     def precision(self) -> bool:
-        """Whether the object is held, and only by the fingertips."""
-        held, lift = self.outcome is Outcome.SUCCESS, self.lift
-        return held and lift is not None and not lift.contacts.other_links
+        """Whether the object is lifted, and only by the fingertips."""
+        lifted, lift = self.outcome is Outcome.SUCCESS, self.lift
+        return lifted and lift is not None and not lift.contacts.other_links
 
     @property
     def stable(self) -> bool:

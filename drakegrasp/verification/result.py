@@ -69,7 +69,7 @@ class PoseTrial:
     removal: Removal | None = None
 
     @property
-    def held(self) -> bool:
+    def lifted(self) -> bool:
         """Whether every fingertip touches the object at the end of the lift, clear of the table."""
         return self.trial.outcome is Outcome.SUCCESS
 
@@ -121,51 +121,51 @@ class Verification:
     # How well it holds
 
     @property
-    def success(self) -> bool:
+    def matches(self) -> bool:
         """Whether the first wrist pose holds, with every contact where it was requested.
 
         "Where it was requested" means within `verify.max_contact_error`. A posture requests no
         contacts, so it is whether it holds.
         """
-        return self.held and not self.farthest_contact > self.config.verify.max_contact_error
+        return self.lifted and not self.farthest_contact > self.config.verify.max_contact_error
 
     @property
-    def held(self) -> bool:
+    def lifted(self) -> bool:
         """Whether the first wrist pose holds the object at the end of the lift, anywhere."""
         return self.outcome is Outcome.SUCCESS
 
     @property
-    def held_any(self) -> bool:
+    def lifted_any(self) -> bool:
         """Whether any of the tried wrist poses holds the object.
 
         The 18 numbers leave the wrist open, and nobody knows in advance which pose holds. This is
         what an oracle that chooses the wrist pose would reach.
         """
-        return self.held or self.held_by is not None
+        return self.lifted or self.lifted_by is not None
 
     @property
-    def held_by(self) -> int | None:
+    def lifted_by(self) -> int | None:
         """Index of the first wrist pose that holds the object, None if no wrist pose does."""
-        return next((i for i, each in enumerate(self.tries) if each.held), None)
+        return next((i for i, each in enumerate(self.tries) if each.lifted), None)
 
     @property
     def precision(self) -> bool:
-        """Whether the object is held, and only by the fingertips."""
-        return self.held and (self.trial is None or self.trial.precision)
+        """Whether the object is lifted, and only by the fingertips."""
+        return self.lifted and (self.trial is None or self.trial.precision)
 
     @property
     def stable(self) -> bool:
         """Whether it is a precision grasp that moves less than 5 mm and 5 degrees in the hand."""
-        return self.held and (self.trial is None or self.trial.stable)
+        return self.lifted and (self.trial is None or self.trial.stable)
 
     @property
-    def sample(self) -> bool:
+    def kept(self) -> bool:
         """Whether the grasp passes the filters of a dataset, except for those in `unjudged`."""
         return self.removal is Removal.KEPT
 
     @property
     def removal(self) -> Removal | None:
-        """The first filter that removes the grasp, `KEPT` if none does; None if not held."""
+        """The first filter that removes the grasp, `KEPT` if none does; None if not lifted."""
         return self.first.removal if self.first else None
 
     @property
@@ -209,8 +209,8 @@ class Verification:
     def farthest_contact(self) -> float:
         """The largest `contact_error` [m]; NaN if no fingertip touches.
 
-        A curve over d of the fraction of grasps that hold within d counts the `held` grasps with a
-        smaller value than d.
+        A curve over d of the fraction of grasps that hold within d counts the `lifted` grasps
+        with a smaller value than d.
         """
         errors = np.zeros(0) if self.contact_error is None else self.contact_error
         known = errors[np.isfinite(errors)]
@@ -246,11 +246,11 @@ class Verification:
         """Readings in which contacts that fail would fit much better, in words."""
         if self.told is not None:
             return self.told
-        fits = self.success and not self.misplaced
+        fits = self.matches and not self.misplaced
         if fits or self.grasp.postures or self.grasp.invalid or self.outcome.inconclusive:
             return ()
         with timed(self.seconds, "hints"):
-            return find_hints(self.grasp, self.nhat_Q_O, fits=self.success)
+            return find_hints(self.grasp, self.nhat_Q_O, fits=self.matches)
 
     @property
     def hint_text(self) -> str:
@@ -317,7 +317,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
             )
 
     # The verdict, and the changes to the row of numbers.
-    verdict = "holds" if verified.held else f"fails ({verified.outcome.label})"
+    verdict = "holds" if verified.lifted else f"fails ({verified.outcome.label})"
     yield f"The grasp of {verified.placed.model.name} {verdict}: {verified.reason}."
     if verified.outcome is Outcome.INVALID:
         return
@@ -373,26 +373,26 @@ def _contacts(verified: Verification, fit: WristFit) -> Iterator[str]:
     if np.isnan(verified.farthest_contact):
         return
 
-    # After closing, and whether that is a success.
+    # After closing, and whether that matches the request.
     angle = np.rad2deg(np.nanmax(np.append(errors[1], 0.0)))
     yield (
         f"After closing, the fingertips touch the object within {in_mm(verified.farthest_contact)} "
         f"of the predicted points, and within {angle:.0f}° of the predicted normals."
     )
-    if verified.held and not verified.success:
+    if verified.lifted and not verified.matches:
         finger = int(np.nanargmax(errors[0])) + 1
         yield (
-            f"It is not a success: fingertip {finger} is more than {in_mm(limit)} from its point, "
-            "so another grasp holds than the requested one."
+            f"It does not match its request: fingertip {finger} is more than {in_mm(limit)} from "
+            "its point, so another grasp holds than the requested one."
         )
 
 
 def _other_poses(verified: Verification) -> str:
     """Return the results of the other wrist poses."""
-    if verified.held_by is None:
+    if verified.lifted_by is None:
         return f"None of {verified.num_tries} wrist poses for these contacts holds it."
     return (
-        f"The wrist pose that fits best does not hold it, but number {verified.held_by + 1} of "
+        f"The wrist pose that fits best does not hold it, but number {verified.lifted_by + 1} of "
         f"{verified.num_tries} does."
     )
 
@@ -409,8 +409,8 @@ def _in_the_hand(verified: Verification, lift: Lift) -> str:
         f"{np.rad2deg(lift.turn):.1f}° in the hand, and at the end {touching}"
     )
 
-    # Name the kind of grasp, if the object is held at all.
-    if not verified.held:
+    # Name the kind of grasp, if the object is lifted at all.
+    if not verified.lifted:
         tips = lift.contacts.touching
         still = f"{int(tips.sum())} of {len(tips)} fingertips still touch it"
         return f"{text}; {still}."

@@ -100,7 +100,7 @@ def _of_contacts(verdict: Verification) -> Verification:
             tried = _try(grasp, p_OQ, nhat_Q_O, fit)
         collides = pass_collisions and tried.trial.outcome is Outcome.START_COLLISION
         (passed if collides else tries).append(tried)
-        if tried.held:
+        if tried.lifted:
             break
     return _judged(
         replace(
@@ -177,7 +177,7 @@ def _of_posture(verdict: Verification) -> Verification:
 
     # The best, and the reason with what the posture left open.
     best, shape = max(
-        tried, key=lambda f: (f[0].held, f[0].stable, f[0].precision, f[0].outcome.stage)
+        tried, key=lambda f: (f[0].lifted, f[0].stable, f[0].precision, f[0].outcome.stage)
     )
     notes, poses = list[str](), len(grasp.stands)
     if not grasp.named:
@@ -245,7 +245,7 @@ def verify_batch(
     Args:
         grasps: Grasps with indices 0 to n - 1, in any order; grasps of one object are adjacent.
         execute: Runs the verifications.
-        report: Is called with the numbers of finished and of successful grasps.
+        report: Is called with the numbers of finished grasps and of those that match.
         on_result: Is called with each result in the caller's order, once all earlier ones exist.
         together: Largest number of grasps of one object in a task. They are sent to a worker with
             one copy of the meshes, and share what the worker computes from the meshes.
@@ -262,7 +262,7 @@ def verify_batch(
         # Workers return what they found, without the meshes.
         for index, found in finished:
             results[index] = Verification(grasp=by_index[index], **found)
-            holding += results[index].success
+            holding += results[index].matches
 
         # Deliver these results, and later results that were waiting for them.
         while delivered in results:

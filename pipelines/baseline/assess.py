@@ -2,7 +2,7 @@
 
   python pipelines/baseline/assess.py classifier.pt OUT/scenes.hdf5 reliability.png
 
-The script judges each grasp that was lifted to a verdict once, from one view of its scene. It
+The script judges each grasp whose lift has a verdict once, from one view of its scene. It
 prints JSON with the AUC and its interval over objects, the Brier score and the reliability curve,
 and draws this curve.
 """
@@ -29,7 +29,7 @@ import drakegrasp as dg
 from drakegrasp.errors import DrakegraspError
 
 #: The two questions that the classifier answers.
-LABELS = ("held", "sample")
+LABELS = ("lifted", "kept")
 #: Bins of the reliability curve; all hold equally many grasps.
 BINS = 10
 #: Number of times that the objects are resampled for an interval.
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def judge(checkpoint: Path, path: Path, split: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return chances and labels (n, 2) of a split's lifted grasps, and their objects (n,)."""
+    """Return chances and labels (n, 2) of a split's tested grasps, and their objects (n,)."""
     said = load(checkpoint, "classifier")
     network, hand = (
         GraspClassifier(len(said["hand"]["directions"])),
@@ -71,16 +71,18 @@ def judge(checkpoint: Path, path: Path, split: str) -> tuple[np.ndarray, np.ndar
     network.load_state_dict(said["weights"])
     network.eval()
 
-    # The first view of each scene; `grasps_in` returns all grasps, and only the lifted ones count.
-    data = dg.SceneDataset(path, split=split, negatives="tested", positives="held", balance="view")
+    # The first view of each scene; `grasps_in` returns all grasps, and only the tested ones count.
+    data = dg.SceneDataset(
+        path, split=split, negatives="tested", positives="lifted", balance="view"
+    )
     scenes = data.tables["views"]["scene"][data.views]
     chances, labels, objects = [], [], []
     for index in np.unique(scenes, return_index=True)[1].tolist():
         item, grasps = data[index], data.grasps_in(int(data.views[index]))
-        lifted = grasps["tested"]
+        tested = grasps["tested"]
         batch = {"points": object_points(item["points"], item["on_object"])[None]}
-        batch |= {k: grasps[k][lifted][None] for k in ("q", *LABELS)}
-        batch["X_TG"] = grasps["X_AG"][lifted][None].astype(np.float32)
+        batch |= {k: grasps[k][tested][None] for k in ("q", *LABELS)}
+        batch["X_TG"] = grasps["X_AG"][tested][None].astype(np.float32)
         tensors = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in batch.items()}
         with torch.no_grad():
             logits, answers = judged(network, hand, centred(tensors))

@@ -50,8 +50,8 @@ def cloud_batches(
         seed: Seed of all random draws.
 
     Yields:
-        `points` (b, n, 3) in {T}; `X_TG` (b, g, 4, 4), `q` (b, g, j), `q_open`, and `held`,
-        `sample`, `tested` (b, g) of the grasps; `shift` (b, 3), the vector subtracted from all
+        `points` (b, n, 3) in {T}; `X_TG` (b, g, 4, 4), `q` (b, g, j), `q_open`, and `lifted`,
+        `kept`, `tested` (b, g) of the grasps; `shift` (b, 3), the vector subtracted from all
         points.
     """
     for each in data:
@@ -64,7 +64,7 @@ def cloud_batches(
         batch = {
             "points": _stack([object_points(i["points"], i["on_object"]) for i in items]),
             "X_TG": _stack([i["X_AG"] for i in items]),
-            **{k: _stack([i[k] for i in items]) for k in ("q", "q_open", "held", "sample")},
+            **{k: _stack([i[k] for i in items]) for k in ("q", "q_open", "lifted", "kept")},
             "tested": _stack([i["tested"] for i in items]),
         }
         yield centred(turned(batch, draw) if augment else batch)

@@ -33,7 +33,7 @@ SAYS = {
 }
 LIMITS = (
     "It learned from simulated lifts of single objects on an empty table, with one hand. It knows "
-    "no clutter, no arm and no real camera's faults beyond the noise that was simulated. A held "
+    "no clutter, no arm and no real camera's faults beyond the noise that was simulated. A lifted "
     "grasp in simulation may fail on a robot: try each on your own first. It is a baseline to "
     "compare with, not a product."
 )

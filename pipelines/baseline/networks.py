@@ -197,7 +197,7 @@ class GraspClassifier(nn.Module):
         self.register_buffer("temperature", torch.ones(2))
 
     def forward(self, cloud: Tensor, X_TG: Tensor, closing: Tensor) -> Tensor:
-        """Return logits (b, 2) of "held" and "sample".
+        """Return logits (b, 2) of "lifted" and "kept".
 
         Args:
             cloud: (b, n, 3), points in {T}.

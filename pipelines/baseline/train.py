@@ -109,8 +109,8 @@ def train_postures(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def train_classifier(arguments: argparse.Namespace) -> dict[str, Any]:
     """Train the network that judges postures, on lifts with a verdict, and calibrate it."""
-    # Also held grasps that are not samples, or both questions would have the same answers.
-    train, valid = _scenes(arguments, "tested", positives="held")
+    # Also lifted grasps that are not samples, or both questions would have the same answers.
+    train, valid = _scenes(arguments, "tested", positives="lifted")
     hand = hand_of(train)
     torch.manual_seed(arguments.seed)
     network = GraspClassifier(len(hand.directions))
@@ -162,13 +162,13 @@ TASKS = {
 
 
 def judged(network: GraspClassifier, hand: HandCoordinates, batch: Batch) -> tuple[Tensor, Tensor]:
-    """Return logits and labels (n, 2), for "held" and "sample", of all grasps of a batch."""
+    """Return logits and labels (n, 2), for "lifted" and "kept", of all grasps of a batch."""
     grasps = batch["X_TG"].shape[1]
     clouds = batch["points"][:, :SEEN].repeat_interleave(grasps, 0)
     logits = network(
         clouds, batch["X_TG"].flatten(0, 1), hand.coordinates(batch["q"].flatten(0, 1))
     )
-    labels = torch.stack([batch["held"], batch["sample"]], -1).flatten(0, 1)
+    labels = torch.stack([batch["lifted"], batch["kept"]], -1).flatten(0, 1)
     return logits, labels.float()
 
 
@@ -198,7 +198,7 @@ def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
     for data in train:
         grasps, scenes = data.tables["grasps"], data.tables["views"]["scene"][data.views]
         for name, values in found.items():
-            values.append(grasps[name][grasps["sample"] & np.isin(grasps["scene"], scenes)])
+            values.append(grasps[name][grasps["kept"] & np.isin(grasps["scene"], scenes)])
     closed, opened = (torch.from_numpy(np.concatenate(found[name])) for name in found)
     if len(closed) < 2:
         raise DataError(f"{train[0].path}: train must have two samples or more, got {len(closed)}")
@@ -208,7 +208,7 @@ def hand_of(train: Sequence[dg.SceneDataset]) -> HandCoordinates:
 
 
 def _scenes(
-    arguments: argparse.Namespace, negatives: Any, positives: Any = "sample"
+    arguments: argparse.Namespace, negatives: Any, positives: Any = "kept"
 ) -> tuple[list[dg.SceneDataset], list[dg.SceneDataset]]:
     """Return the parts that train and the parts that validate.
 

@@ -111,13 +111,14 @@ characters never reach a terminal, log or page.
 The two data files contain no NaN. In `trials.hdf5` a value that does not exist for a row is NaN
 (floats), 0 or false: the column "from" above names the stage from which a value exists. Contact
 points and normals, and how they fit the mesh, are also NaN for a finger that does not touch. The
-stage of a row follows from its outcome: `success`, `slipped`, `partly_held`, `dropped` and `moved`
-were lifted; `missing_fingertip` and `hand_contact` were closed; `table_contact` was closed, and
-lifted if `time_lift` is a number (then the object still touched the table, or the hand scraped it
-in the lift); all others were only placed. "After the lift" is the moment at which the lift ended;
-for `moved`, the moment at which it was aborted. `solver_error`, `timeout` and `crashed` mean that
-the simulator failed: never count them as failed grasps. `moved` means that the attempt is not a
-sample, not that the hand would have lost the object.
+stage of a row follows from its outcome: with `success`, `slipped`, `partly_held`, `dropped` and
+`moved` a lift was tried; with `missing_fingertip` and `hand_contact` the hand was closed; with
+`table_contact` it was closed, and a lift was tried if `time_lift` is a number (then the object
+still touched the table, or the hand scraped it in the lift); all others were only placed. "After
+the lift" is the moment at which the lift ended; for `moved`, the moment at which it was aborted.
+`solver_error`, `timeout` and `crashed` mean that the simulator failed: never count them as failed
+grasps. `moved` means that the attempt is not a sample, not that the hand would have lost the
+object.
 """
 
 
@@ -135,11 +136,11 @@ The groups `/train`, `/valid` and `/test` have the same fields; images and masks
 chunk per sample, gzip 1 with shuffle. They contain only successes that pass the filters.
 
 A sample has two grasps. `grasps` are the contacts at the moment when closing ended, on the object
-before it is freed. `grasps_held` are the contacts at the end of the lift, when the object may have
-moved in the hand; they are drawn on the object in its resting pose, as if hand and object were
-moved back together. All names that end in `_held` refer to that moment and are expressed in this
+before it is freed. `grasps_lifted` are the contacts at the end of the lift, when the object may
+have moved in the hand; they are drawn on the object in its resting pose, as if hand and object were
+moved back together. All names that end in `_lifted` refer to that moment and are expressed in this
 way. `grasp_props/` describes how well the hand holds; its terms are explained in
-[outcomes](outcomes.md#held-precision-stable). `conditions/` are the values in use, whether they
+[outcomes](outcomes.md#lifted-precision-stable). `conditions/` are the values in use, whether they
 were drawn for the attempt or not, see [randomisation](../explanation/randomization.md).
 """
 
@@ -150,7 +151,7 @@ _SCENES = """
 scene is an object in a resting pose, somewhere on the table. All cameras of a scene share its
 colours and its light, and each camera has its own depth noise. The file has the attributes of
 `trials.hdf5` except `K`; `near` and `far` are those of its cameras. Images are stored in one chunk
-each, gzip 1. Unlike in the data files, values of a hand that was not lifted are NaN.
+each, gzip 1. Unlike in the data files, values are NaN where no lift was tried.
 
 ### /scenes
 """

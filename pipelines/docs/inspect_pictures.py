@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     address = f"http://127.0.0.1:{listener.getsockname()[1]}"
 
     # Take the pictures: the galleries, the first grasp, the training scene with the most tested
-    # grasps, and in the dark theme a held prediction that is among the farthest from the stored
+    # grasps, and in the dark theme a lifted prediction that is among the farthest from the stored
     # grasps.
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     with sync_playwright() as driver:
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for kind, name, path in (
             (AttemptGallery, "gallery", "/?split=samples"),
             (Scenes, "scenes", "/scenes?split=train&sort=tested"),
-            (Predictions, "predictions", "/predictions?verdict=held&sort=true_error"),
+            (Predictions, "predictions", "/predictions?verdict=lifted&sort=true_error"),
         ):
             if kind not in inspection.galleries():
                 continue

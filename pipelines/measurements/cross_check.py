@@ -3,12 +3,12 @@
     python pipelines/measurements/cross_check.py OUT 600 --out report.json
 
 The lifts are drawn with the dataset's seed, so that every machine draws the same. They are drawn in
-turn from samples, from held grasps that the filters removed, and from lost lifts, and within each
+turn from samples, from lifted grasps that the filters removed, and from lost lifts, and within each
 group in turn from all objects. Each lift is tried from the stored palm pose and spread, with the
 dataset's configuration and drive. The script needs the extra `[peer]`. It prints JSON for each
-group: how many lifts were drawn, how many are lifted in MuJoCo (after closing all pads touch, and
+group: how many lifts were drawn, how many are tried in MuJoCo (after closing all pads touch, and
 nothing else), how many hold there, the fractions with their 95 % confidence intervals, and why the
-others were not lifted. The report also has one row per lift.
+others had no lift. The report also has one row per lift.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from drakegrasp.simulation.attempt import Attempt, Materials, usual_conditions
 from drakegrasp.simulation.drive import drive_of
 
 T = TypeVar("T")
-#: Result of a lift in the dataset: a sample, held but removed by the filters, or lost.
+#: Result of a lift in the dataset: a sample, lifted but removed by the filters, or lost.
 Group = Literal["sample", "removed", "lost"]
 GROUPS: tuple[Group, ...] = get_args(Group)
 #: Outcomes of lifts that were lost. `table_contact` after closing is not a lift. An attempt that
@@ -91,7 +91,7 @@ def draw_lifts(out: Path, count: int) -> list[StoredLift]:
     seed = manifest.config.seed
     lifts = _read_lifts(out)
     if not lifts:
-        raise DataError(f"{out}: must be a dataset with lifts, got one in which nothing was lifted")
+        raise DataError(f"{out}: must be a dataset with lifts, got one in which no lift was tried")
 
     # Each group takes its objects in turn, and the groups are taken in turn.
     piles = []
@@ -122,7 +122,7 @@ def cross_check(out: Path, count: int) -> dict[str, Any]:
         for name, same in groupby(sorted(lifts, key=_by_object), key=lambda x: x.object_name):
             for row in _try_object(out, name, list(same), manifest.config):
                 rows.append(row)
-                progress(len(rows), len(lifts), held=sum(_holds(row) for row in rows))
+                progress(len(rows), len(lifts), lifted=sum(_holds(row) for row in rows))
     return {
         "drive": drive_of(load_hand(config.hand_source), config.lift),
         "groups": {
@@ -137,25 +137,25 @@ def cross_check(out: Path, count: int) -> dict[str, Any]:
 
 
 def agreement(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return how many lifts of a group are lifted in MuJoCo, and how many of these hold.
+    """Return how many lifts of a group are tried in MuJoCo, and how many of these hold.
 
     Args:
         rows: Rows of the report of `cross_check`, under "lifts".
 
     Returns:
-        Numbers of lifts that were drawn, lifted and held; the fractions that hold of all drawn
-        lifts and of those lifted in MuJoCo, with their intervals (None if there are no lifts); and
+        Numbers of lifts that were drawn, tried and lifted; the fractions that hold of all drawn
+        lifts and of those tried in MuJoCo, with their intervals (None if there are no lifts); and
         the outcomes of the others.
     """
-    lifted = [row for row in rows if row["lifted"]]
-    held = sum(_holds(row) for row in lifted)
+    tried = [row for row in rows if row["tried"]]
+    lifted = sum(_holds(row) for row in tried)
     return {
         "drawn": len(rows),
-        "lifted": len(lifted),
-        "held": held,
-        "of_all": _share(held, len(rows)),
-        "of_lifted": _share(held, len(lifted)),
-        "not_lifted": dict(Counter(row["there"] for row in rows if not row["lifted"])),
+        "tried": len(tried),
+        "lifted": lifted,
+        "of_all": _share(lifted, len(rows)),
+        "of_tried": _share(lifted, len(tried)),
+        "not_tried": dict(Counter(row["there"] for row in rows if not row["tried"])),
     }
 
 
@@ -169,7 +169,7 @@ def _share(hits: int, count: int) -> dict[str, float] | None:
 
 def _read_lifts(out: Path) -> list[StoredLift]:
     """Return all lifts of a dataset in the order of its rows: lifts of an object are together."""
-    # Only attempts that were lifted have a lift time.
+    # Only attempts in which a lift was tried have a lift time.
     trials = Trials(out).where(outcome=[Outcome.SUCCESS, *ENDS])
     # The MuJoCo model does not support hands with a motor for each joint.
     trials = trials[np.isfinite(trials["time_lift"]) & ~trials["own_motors"]]
@@ -183,12 +183,12 @@ def _read_lifts(out: Path) -> list[StoredLift]:
     ):
         row = dict(zip(columns, values, strict=True))
         outcome = Outcome(int(row["outcome"]))
-        held: Group = "sample" if row["removal"] == Removal.KEPT else "removed"
+        group: Group = "sample" if row["removal"] == Removal.KEPT else "removed"
         lifts.append(
             StoredLift(
                 trial_id=trial_id,
                 object_name=row["object_name"],
-                group=held if outcome is Outcome.SUCCESS else "lost",
+                group=group if outcome is Outcome.SUCCESS else "lost",
                 outcome=outcome,
                 resting=int(row["resting"]),
                 pregrasp=Attempt(X_OG=unpack_pose(row["X_OG"]), spread=float(row["spread"])),
@@ -225,10 +225,10 @@ def _try_object(
             "group": lift.group,
             "outcome": lift.outcome.label,
             "there": trial.outcome.label,
-            "lifted": trial.lifted,
+            "tried": trial.tried,
             # JSON has no NaN.
-            "slip": trial.slip if trial.lifted else None,
-            "turn": trial.turn if trial.lifted else None,
+            "slip": trial.slip if trial.tried else None,
+            "turn": trial.turn if trial.tried else None,
         }
 
 

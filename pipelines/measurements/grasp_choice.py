@@ -10,7 +10,7 @@ and `drakegrasp.propose` returns grasps for it. The choices are the first propos
 best one by closing, and the best one after lifts of the first K on the object as completed from the
 view. The script tries the choices on the object itself, and the first ones by closing for the bound
 ("oracle"). It prints a line per object, then JSON: for each choice the fractions of objects that
-are held, and that are a sample, each with the 95 % bootstrap interval over the objects, also for
+are lifted, and that are a sample, each with the 95 % bootstrap interval over the objects, also for
 the differences; the stated chances of the choice, in ten bins; and CPU seconds per view.
 
 Without other options it uses the first built-in object of each class. `--prepared` uses the objects
@@ -59,7 +59,7 @@ Array = npt.NDArray[np.float64]
 #: The camera: distance [m], minimum elevation and range of elevations [degree], half the width of
 #: the image at a distance of 1 m [m/m], pixels along an edge.
 DISTANCE, ELEVATION, RANGE, HALF, PIXELS = 0.65, 35.0, 30.0, 0.2, 96
-#: Numbers of first proposals that are lifted on the completed object.
+#: Numbers of first proposals that are tried on the completed object.
 SIMULATED = (5, 10)
 #: Number of bootstrap resamplings.
 DRAWS = 10_000
@@ -132,7 +132,7 @@ def prepared_objects(
 
 
 def measure(name: str, placed: PlacedObject, protocol: str | None) -> dict[str, Any]:
-    """Return for each choice of a grasp of an object whether it is held and whether it is a sample.
+    """Return for each choice of a grasp of an object whether it is lifted and a sample.
 
     Args:
         name: Name of the object.
@@ -168,19 +168,19 @@ def measure(name: str, placed: PlacedObject, protocol: str | None) -> dict[str, 
     listed = {key: ends[i] for key, i in choices.items()}
     listed["oracle"] = np.max([ends[i] for i in first], axis=0).tolist()
     click.echo(f"{name}: {', '.join(f'{k} {v[1]:.0f}' for k, v in listed.items())}", err=True)
-    lifted = np.flatnonzero(np.isfinite(ranked.share))
+    simulated = np.flatnonzero(np.isfinite(ranked.share))
     return {
         "name": name,
         "choices": listed,
         "chance": chance,
-        "lifted": [[float(ranked.chance[i]), ends[int(i)][1]] for i in lifted],
+        "tried": [[float(ranked.chance[i]), ends[int(i)][1]] for i in simulated],
         "seconds": spent,
         "said": str(grasps.said[choices[f"simulate {max(SIMULATED)}"]]),
     }
 
 
 def tried(placed: PlacedObject, grasps: GraspTable, i: int) -> list[float]:
-    """Return whether a grasp is held, and whether it is a sample."""
+    """Return whether a grasp is lifted, and whether it is a sample."""
     trial = dg.run_trial(placed, grasps.posture(i, placed.X_TO_simulated))
     removal = judge_sample(placed.model, trial, placed.config)
     return [float(trial.outcome == dg.Outcome.SUCCESS), float(removal is Removal.KEPT)]
@@ -226,7 +226,7 @@ def summary(found: list[dict[str, Any]]) -> dict[str, Any]:
     names = list(found[0]["choices"])
     table = np.array([[each["choices"][name] for name in names] for each in found])
     result: dict[str, Any] = {"objects": len(found)}
-    for k, end in enumerate(("held", "sample")):
+    for k, end in enumerate(("lifted", "kept")):
         columns = dict(zip(names, table[:, :, k].T, strict=True))
         differences = {
             f"{name} minus {other}": columns[name] - columns[other]
@@ -238,8 +238,8 @@ def summary(found: list[dict[str, Any]]) -> dict[str, Any]:
     first = f"simulate {max(SIMULATED)}"
     of_first = [(each["chance"][first], each["choices"][first][1]) for each in found]
     result["stated chances of the first choice"] = bins(of_first)
-    result["stated chances of all that were lifted"] = bins(
-        [tuple(pair) for each in found for pair in each["lifted"]]
+    result["stated chances of all that were tried"] = bins(
+        [tuple(pair) for each in found for pair in each["tried"]]
     )
     result["cpu_seconds"] = {
         key: [

@@ -42,13 +42,13 @@ class PeerTrial:
 
     Attributes:
         outcome: The verdict.
-        lifted: Whether the closed hand was allowed to lift.
-        slip: Distance by which {O} moved in {G} during the lift [m]; NaN if not lifted.
-        turn: Angle by which {O} rotated in {G} during the lift [rad]; NaN if not lifted.
+        tried: Whether the closed hand was allowed to lift.
+        slip: Distance by which {O} moved in {G} during the lift [m]; NaN if no lift was tried.
+        turn: Angle by which {O} rotated in {G} during the lift [rad]; NaN if no lift was tried.
     """
 
     outcome: Outcome
-    lifted: bool = False
+    tried: bool = False
     slip: float = np.nan
     turn: float = np.nan
 
@@ -173,7 +173,7 @@ class MujocoBaseline:
         motion = invert_pose(X_GO) @ self._object_in_hand()
         return PeerTrial(
             outcome=verdict,
-            lifted=True,
+            tried=True,
             slip=float(np.linalg.norm(motion[:3, 3])),
             turn=rotation_angle(motion[:3, :3]),
         )

@@ -5,7 +5,7 @@
     python pipelines/measurements/relift.py OUT --rows attempts --set lift.stop_when=lost_sample
 
 Each attempt is tried as it is stored, and then with the settings of `--set`. The script prints JSON
-for both: the number of lifts with a verdict; the numbers that are held and that are samples, with
+for both: the number of lifts with a verdict; the numbers that are lifted and that are samples, with
 their intervals; the outcomes that differ from those as stored; and CPU seconds. Samples are judged
 by the filters except those that need pictures, the outlier filter and user-defined filters. For
 lifts it also prints the medians of slip, turn, force and of how far a closing joint opened.
@@ -53,7 +53,7 @@ def chosen_rows(out: Path, kind: str, count: int, seed: int) -> npt.NDArray[np.i
     """Return ids of drawn attempts of one kind, or of equally many samples and other lifts."""
     trials = Trials(out)
     ids, is_lift = trials.trial_ids, np.isfinite(trials["time_lift"])
-    is_sample = np.isin(ids, trials.where(sample=True).trial_ids)
+    is_sample = np.isin(ids, trials.where(kept=True).trial_ids)
     groups = {
         "attempts": [np.isfinite(trials["time_close"])],
         "lifts": [is_lift],
@@ -100,7 +100,7 @@ def try_again(
         record = run_attempt(scene, model.resting_poses[attempt.resting], attempt, rules)
         spent = time.process_time() - start
         removal = judge_sample(model.model, record, rules, views=False)
-        told = {"outcome": record.outcome.label, "sample": removal is Removal.KEPT}
+        told = {"outcome": record.outcome.label, "kept": removal is Removal.KEPT}
         found.append({"change": change, **told, "seconds": spent, **measured(hand, record)})
     return found
 
@@ -136,18 +136,18 @@ def _of_change(pairs: Sequence[tuple[Found, Found]]) -> Found:
         for stored, found in pairs
         if stored["outcome"] != found["outcome"]
     )
-    lifted = [found for found in own if "slip" in found]
+    tried = [found for found in own if "slip" in found]
     return {
         "tried": len(pairs),
         "with a verdict": len(own),
-        "held": _share([found["outcome"] == Outcome.SUCCESS.label for found in own]),
-        "sample": _share([found["sample"] for found in own]),
+        "lifted": _share([found["outcome"] == Outcome.SUCCESS.label for found in own]),
+        "kept": _share([found["kept"] for found in own]),
         "CPU seconds": round(sum(found["seconds"] for _, found in pairs), 2),
         "changed": dict(others.most_common()),
         "medians": {
-            name: round(float(np.median([found[name] for found in lifted])), 3)
+            name: round(float(np.median([found[name] for found in tried])), 3)
             for name in ("slip", "turn", "force", "opened")
-            if lifted
+            if tried
         },
     }
 

@@ -451,7 +451,7 @@ def test_verdicts_are_lines_of_json_in_the_order_of_the_grasps(cube: Path, tmp_p
     tried, bad, far = (json.loads(line) for line in result.stdout.splitlines())
     assert (tried["index"], tried["object"], tried["tries"]) == (0, "1_cube_a", 1)
     assert tried["outcomes"] == [tried["outcome"]]
-    assert (bad["index"], bad["outcome"], bad["success"]) == (1, "invalid", False)
+    assert (bad["index"], bad["outcome"], bad["matches"]) == (1, "invalid", False)
     assert bad["reason"] == "number 1 is nan, not finite"
     hint = "points in millimetres instead of metres"
     assert far["hints"] == hint and far["p_OQ"][0] == [30.0, 0.0, 0.0]  # nothing is changed by it
@@ -488,7 +488,7 @@ def test_grasps_of_a_dataset_are_verified_as_they_are(small_dataset: Path, camer
     assert [line["object"] for line in lines] == data.column("object_props/object_name").tolist()
     # On the surface, so frames and poses were put together rightly.
     assert max(d for line in lines for d in line["surface_distance"]) < 2e-3
-    assert any(line["success"] for line in lines)
+    assert any(line["matches"] for line in lines)
 
 
 def test_module_runs_as_a_program() -> None:

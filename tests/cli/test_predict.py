@@ -126,9 +126,9 @@ def test_lifts_change_the_chances_and_what_to_expect_is_printed(files: Path) -> 
             confidence = file["confidence"][:]
         assert len(confidence) == 3 and (np.diff(confidence) <= 0.0).all()
         assert f"{confidence[0]:.0%}" in told[-1]
-    assert "none was lifted" in told[0]
-    assert "1 lifted on the object completed from the cloud" in told[1]
-    assert "1 lifted on the object completed from the view" in told[2]
+    assert "no lift was tried" in told[0]
+    assert "1 tried on the object completed from the cloud" in told[1]
+    assert "1 tried on the object completed from the view" in told[2]
     assert "chance" not in predict(files, "cloud.npy --simulate 0 --quiet").stderr
 
 

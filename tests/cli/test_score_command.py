@@ -52,7 +52,7 @@ def test_a_card_does_not_depend_on_the_number_of_workers(
     card = json.loads(again.stdout)
     assert card | {"again": ""} == json.loads(texts[0]) | {"again": ""}
     assert list(card["sets"]) == ["net.npy", "old.npy", "own", "constant"]
-    assert card["sets"]["own"]["measures"]["held"]["value"] > 0.0
+    assert card["sets"]["own"]["measures"]["lifted"]["value"] > 0.0
 
 
 @pytest.mark.nightly

@@ -95,7 +95,7 @@ def test_palm_and_contacts_of_a_sample_are_as_far_apart_as_in_its_trial(
         sample, trial = data["test"], trials["trials"]
         number = int(sample["trial_id"][2])
         p_GQ = {}
-        for when, end in (("closed", ""), ("lifted", "_held")):
+        for when, end in (("closed", ""), ("lifted", "_lifted")):
             X_GC = invert_pose(unpack_pose(sample[f"grasp_props/X_CG{end}"][2]))
             p_CQ, _ = unpack_grasp(sample[f"grasps{end}"][2])
             X_GO = invert_pose(unpack_pose(trial["X_OG" if not end else "X_OG_lifted"][number]))
@@ -245,7 +245,7 @@ def test_contact_is_in_view_within_the_image_and_before_the_camera(p_CQ: Any, se
     assert in_image(K, 33, p_CQ).tolist() == [True, seen, False]
 
 
-@pytest.mark.parametrize("override", ["filters.require=held", "filters.max_slip=null"])
+@pytest.mark.parametrize("override", ["filters.require=lifted", "filters.max_slip=null"])
 def test_filters_that_lifts_were_ended_by_cannot_be_looser(tmp_path: Path, override: str) -> None:
     """Of the lifts that ended nobody knows whether they would be samples then."""
     out = make_dataset(

@@ -120,17 +120,17 @@ def test_limits_of_anomaly_are_off_until_they_are_set(field: str, limit: str) ->
     assert removal.tolist() == [Removal.KEPT, Removal.ANOMALOUS, Removal.ANOMALOUS]
 
 
-def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:
-    held = FilterConfig(require="held")
+def test_lifted_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:
+    lifted = FilterConfig(require="lifted")
     bad = good(3).with_columns(
         other_links=np.full(3, 4, np.uint8), slip=np.ones(3), turn=np.full(3, 3.0)
     )
-    assert np.all(judge(bad, held) == Removal.KEPT)
+    assert np.all(judge(bad, lifted) == Removal.KEPT)
     off = bad.with_columns(normal_angle=np.ones(3))
-    assert np.all(judge(off, held) == Removal.NORMAL_OFF)
+    assert np.all(judge(off, lifted) == Removal.NORMAL_OFF)
 
 
-@pytest.mark.parametrize("name", ["grasp_T", "held_O"])
+@pytest.mark.parametrize("name", ["grasp_T", "lifted_O"])
 def test_normal_of_opposed_patches_is_off_the_surface(name: str) -> None:
     """Its length is zero, so that it has no direction: neither grasp of a sample may have one."""
     grasps = good(3).grasp_T.copy()

@@ -78,9 +78,9 @@ def test_samples_come_by_index(data_file: Path) -> None:
     assert sample.image.shape == (4, 16, 16)
     assert sample.image.dtype == np.float32
     assert np.all(sample.grasp == 3.0)
-    assert sample.grasp_held.shape == (18,)
-    assert np.all(sample.grasp_held == 3.0)
-    assert sample.grasp_props["f_Q_C_held"].shape == (3, 3)
+    assert sample.grasp_lifted.shape == (18,)
+    assert np.all(sample.grasp_lifted == 3.0)
+    assert sample.grasp_props["f_Q_C_lifted"].shape == (3, 3)
     assert sample.grasp_props["stable"]
     assert sample.trial_id == 3
     assert sample.props["object_name"] == "object 3 ü"

@@ -71,10 +71,10 @@ def test_good_and_bad_grasps_come_in_turns(path: Path) -> None:
     data = SceneDataset(path, points=16, grasps=6, split="test")
     for item in data:
         assert item["sample"].tolist() == [True, False] * 3
-        assert item["tested"].all() and not item["held"][1::2].any()
+        assert item["tested"].all() and not item["lifted"][1::2].any()
     assert all(item["sample"].all() for item in SceneDataset(path, points=16, negatives="none"))
     closed = SceneDataset(path, points=16, grasps=64, negatives="closed")[0]
-    assert not closed["tested"].all() and closed["held"][::2].all()
+    assert not closed["tested"].all() and closed["lifted"][::2].all()
 
 
 def test_objects_come_as_often_as_each_other(path: Path) -> None:

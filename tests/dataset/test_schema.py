@@ -66,7 +66,7 @@ def test_contact_fields_are_those_that_the_simulation_reads() -> None:
 
 @pytest.mark.parametrize("table", [TRIAL_FIELDS, VERIFICATION_FIELDS])
 def test_stage_of_a_field_is_that_of_its_measurement(table: tuple[Field, ...]) -> None:
-    for path, stage in (("trial.closed.", Stage.CLOSED), ("trial.lift.", Stage.LIFTED)):
+    for path, stage in (("trial.closed.", Stage.CLOSED), ("trial.lift.", Stage.TRIED)):
         stages = {field.stage for field in table if field.of.startswith(path)}
         assert stages == {stage}
     # A hand that closes on a fixed object takes nothing off the table.

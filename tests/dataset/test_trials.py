@@ -95,8 +95,8 @@ def test_choice_is_of_what_was_asked_for(
 def test_removed_success_is_no_sample(out: Path) -> None:
     assemble(out, rejected=[27])
     own = Trials(out).where(outcome="success", object_name="3_brick")
-    assert own.where(sample=True).trial_ids.tolist() == [24, 35]
-    assert own.where(sample=False).trial_ids.tolist() == [27]
+    assert own.where(kept=True).trial_ids.tolist() == [24, 35]
+    assert own.where(kept=False).trial_ids.tolist() == [27]
 
 
 @pytest.mark.parametrize(

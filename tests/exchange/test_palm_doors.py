@@ -57,10 +57,10 @@ def test_graspgen_is_verified_on_a_mesh_in_centimetres(tmp_path, monkeypatch):
     done = run("verify", "box.yaml", *FRANKA, "--link", "graspgen", "--workers", "1")
     assert done.exit_code == 0, done.stderr
     verdicts = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [verdict["success"] for verdict in verdicts] == [True, False]
+    assert [verdict["matches"] for verdict in verdicts] == [True, False]
     # As if it were the palm link's, the fingers close along the long edges, which are too far.
     done = run("verify", "box.yaml", *FRANKA, "--workers", "1")
-    assert not any(json.loads(line)["success"] for line in done.stdout.splitlines())
+    assert not any(json.loads(line)["matches"] for line in done.stdout.splitlines())
 
 
 def test_grasps_of_an_object_are_for_each_of_its_rows_and_ranked(out, tmp_path):

@@ -82,7 +82,7 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
     result = run(*given, "--out", tmp_path / "lift.h5", "--json")
     assert result.exit_code == 0, result.output
     held, none, lost = map(json.loads, result.stdout.splitlines())
-    assert held["held"] and held["success"] and held["fit_residual"] is None
+    assert held["lifted"] and held["matches"] and held["fit_residual"] is None
     np.testing.assert_allclose(held["closed_q"], end.q, atol=1e-3)
     np.testing.assert_allclose(held["X_OG"], np.asarray(record.X_OG), atol=1e-5)
     assert none["outcome"] == "invalid"
@@ -90,7 +90,7 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
     assert lost["outcome"] == "screened"  # by geometry, as a build does
     assert lost["reason"].startswith("geometry shows that not every fingertip")
     with h5py.File(tmp_path / "lift.h5") as file:
-        assert file["grasps/success"][:].tolist() == [True, False, False]
+        assert file["grasps/matches"][:].tolist() == [True, False, False]
 
     grasp = pack_grasp(end.contacts.p_OQ, end.contacts.nhat_Q_O)
     np.save(tmp_path / "18.npy", np.array([np.full(18, np.nan), grasp]))
@@ -230,7 +230,7 @@ def test_score_by_a_protocol_says_so_on_the_card(
     assert set(card["sets"]["constant"]["outcomes"]) <= known
     assert " --protocol dexgraspbench " in card["again"]
     text = (tmp_path / "card" / "card.md").read_text()
-    assert "held(d)" not in text and "JYChen18/DexGraspBench" in text
+    assert "lifted(d)" not in text and "JYChen18/DexGraspBench" in text
 
     # Convex parts stay in its folder: another score there cuts none.
     assert list((tmp_path / "card" / "convex_parts").iterdir())

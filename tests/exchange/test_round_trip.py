@@ -50,7 +50,7 @@ RULES = (
 OBJECTS = ("objects.resting_poses=8", "seed=6", "objects.mass=0.1", "physics.friction_hand=0.8")
 #: Every success is a sample.
 SAMPLES = (
-    "filters.require=held",
+    "filters.require=lifted",
     "filters.outlier_sigma=0",
     "filters.min_depth_variance=0",
     "filters.min_camera_height=-1",
@@ -190,7 +190,7 @@ def test_what_goes_out_comes_in_again(
         )
     for where in ways:
         found = verified(path, *where)
-        assert [(v["outcome"], v["stable"], v["held"]) for v in found] == stored
+        assert [(v["outcome"], v["stable"], v["lifted"]) for v in found] == stored
         slips = [v["slip"] for v in found]
         # A quaternion and a yaw less are other last digits, and one sample slides far.
         np.testing.assert_allclose(slips, samples["slip"][order], rtol=0.1)
@@ -204,7 +204,7 @@ def test_what_goes_out_comes_in_again(
     assert result.exit_code == 0, result.output
     lines = [json.loads(line) for line in (card / VERDICTS).read_text().splitlines()]
     judged = [line for line in lines if "outcome" in line]
-    assert [(v["outcome"], v["held"]) for v in judged] == [("success", True)] * len(samples)
+    assert [(v["outcome"], v["lifted"]) for v in judged] == [("success", True)] * len(samples)
     assert sorted(v["stable"] for v in judged) == sorted(samples["stable"].tolist())
 
     # As a dataset of its own.

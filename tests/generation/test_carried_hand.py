@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.sim, needs_egl]
 SETTINGS = (
     *("builtin.per_class=1", "objects.mass=0.2", "camera.size=32", "candidates.max=9"),
     *("candidates.standoffs=[0.07]", "lift.max_speed=1", "lift.max_acceleration=10"),
-    *("filters.outlier_sigma=0", "filters.require=held"),
+    *("filters.outlier_sigma=0", "filters.require=lifted"),
 )
 
 

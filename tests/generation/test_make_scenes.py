@@ -71,15 +71,15 @@ def test_objects_are_turned_and_moved_and_cameras_differ_by_split(scenes: Path) 
 
 def test_only_lifts_to_a_verdict_are_tested(scenes: Path) -> None:
     with h5py.File(scenes) as file:
-        grasps = {name: file["grasps"][name][:] for name in ("outcome", "tested", "held", "sample")}
+        grasps = {name: file["grasps"][name][:] for name in ("outcome", "tested", "lifted", "kept")}
         ids = file["grasps/trial_id"][:]
     tested = set(grasps["outcome"][grasps["tested"]].tolist())
     assert tested == {Outcome.SUCCESS, Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT}
     untested = set(grasps["outcome"][~grasps["tested"]].tolist())
     # A hand that touched the table after closing was not lifted.
     assert untested == {Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT}
-    assert (grasps["held"] == (grasps["outcome"] == Outcome.SUCCESS)).all()
-    assert grasps["sample"].sum() > 0 and len(np.unique(ids)) == len(ids)
+    assert (grasps["lifted"] == (grasps["outcome"] == Outcome.SUCCESS)).all()
+    assert grasps["kept"].sum() > 0 and len(np.unique(ids)) == len(ids)
 
 
 def test_other_settings_than_of_scenes_are_refused(out: Path) -> None:

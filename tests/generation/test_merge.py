@@ -102,7 +102,7 @@ def test_rejections_stay_and_are_inspected(sound: Path, out: Path, tmp_path: Pat
     state = read_snapshot(tmp_path / "into")
     place = state.find(key)
     assert place is not None
-    assert state.table.held[place]
+    assert state.table.lifted[place]
 
 
 # What is refused
@@ -192,7 +192,7 @@ def test_merged_builds_replay_bit_equal(tmp_path: Path) -> None:
     sources = find_meshes(tmp_path / "meshes")
     drawn = [
         *("candidates.max=8", "unit_candidates=4", "candidates.method=[normals, rotations]"),
-        *("objects.resting_poses=2", "filters.outlier_sigma=0", "filters.require=held"),
+        *("objects.resting_poses=2", "filters.outlier_sigma=0", "filters.require=lifted"),
         "physics.friction_hand=1.5",
     ]
     config = load_config("randomized", overrides=drawn)

@@ -19,7 +19,7 @@ def dataset(tmp_path_factory):
 @pytest.mark.parametrize("kind", ["attempts", "lifts", "samples", "both"])
 def test_drawn_rows_are_of_their_kind(dataset, kind):
     trials = Trials(dataset)
-    samples = set(trials.where(sample=True).trial_ids.tolist())
+    samples = set(trials.where(kept=True).trial_ids.tolist())
     lifts = set(trials.trial_ids[np.isfinite(trials["time_lift"])].tolist())
     closed = set(trials.trial_ids[np.isfinite(trials["time_close"])].tolist())
     every = {"attempts": closed, "samples": samples}.get(kind, lifts)
@@ -33,8 +33,8 @@ def test_drawn_rows_are_of_their_kind(dataset, kind):
 
 
 def test_summary_counts_what_has_a_verdict():
-    def row(change, outcome, sample, **more):
-        told = {"change": change, "outcome": outcome.label, "sample": sample, "seconds": 1.0}
+    def row(change, outcome, kept, **more):
+        told = {"change": change, "outcome": outcome.label, "kept": kept, "seconds": 1.0}
         return {**told, **more}
 
     rows = [
@@ -42,7 +42,7 @@ def test_summary_counts_what_has_a_verdict():
         [row("as stored", Outcome.SUCCESS, False), row("half step", Outcome.TIMEOUT, False)],
     ]
     found = relift.summary(rows)
-    assert found["as stored"]["held"][0] == 2 and found["as stored"]["sample"][0] == 1
+    assert found["as stored"]["lifted"][0] == 2 and found["as stored"]["kept"][0] == 1
     half = found["half step"]
-    assert (half["tried"], half["with a verdict"], half["held"][0]) == (2, 1, 0)
+    assert (half["tried"], half["with a verdict"], half["lifted"][0]) == (2, 1, 0)
     assert half["changed"] == {"success -> slipped": 1, "success -> timeout": 1}

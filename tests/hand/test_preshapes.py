@@ -140,11 +140,11 @@ def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:
     unused = np.zeros((40, 3), dtype=bool)
     unused[20:, 1] = True
     lacking = np.tile(np.repeat(unused, 3, axis=1), 2)
-    grasp, held = grasps.grasp_T.copy(), grasps.held_O.copy()
+    grasp, held = grasps.grasp_T.copy(), grasps.lifted_O.copy()
     grasp[lacking] = held[lacking] = np.nan
     grasp[3, 4] = np.nan
     grasp[6, 4] = grasp[30, 0] = 50.0
-    shaped = grasps.with_columns(grasp_T=grasp, held_O=held, unused=unused)
+    shaped = grasps.with_columns(grasp_T=grasp, lifted_O=held, unused=unused)
     removal = judge(shaped, FilterConfig())
     assert np.flatnonzero(removal).tolist() == [3, 6, 30]
     assert removal[3] == Removal.OFF_SURFACE

@@ -174,7 +174,7 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         **draw_conditions(model, config, number // 3, number % 3).values(),
     }
     after_lift = number == AFTER_LIFT
-    stage = Stage.LIFTED if after_lift else outcome.stage
+    stage = Stage.TRIED if after_lift else outcome.stage
     touch = np.array([True, True, outcome is not Outcome.MISSING_FINGERTIP])
     clearance = np.nan if config.close.scrape_depth is None else CLEARANCE
     if stage >= Stage.CLOSED:
@@ -182,7 +182,7 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         row |= {"time_close": 1.0, "clearance_close": clearance}
         row |= {"closed_other_links": outcome is Outcome.HAND_CONTACT}
         row["closed_hand_on_table"] = outcome is Outcome.TABLE_CONTACT and not after_lift
-    if stage >= Stage.LIFTED:
+    if stage >= Stage.TRIED:
         touch = touch & (outcome is not Outcome.DROPPED)
         touch[0] &= outcome is not Outcome.SLIPPED
         row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP, 1.25).items()}

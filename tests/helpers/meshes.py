@@ -110,6 +110,6 @@ SMALL = [
         "split.by=class",
         "split.train_classes=[wineglass]",
     ),
-    *("filters.outlier_sigma=0", "filters.require=held", "filters.max_normal_angle_deg=null"),
+    *("filters.outlier_sigma=0", "filters.require=lifted", "filters.max_normal_angle_deg=null"),
     *("lift.max_speed=2", "lift.max_acceleration=20", "lift.hold_time=0.1"),
 ]

@@ -46,7 +46,7 @@ BENCHMARK, BENCHMARK_CANDIDATES = ("4_wineglass_1", "1_mug_2"), 3
 #: Verdicts of each method, and of postures.
 VERDICTS, POSTURES = 15, 6
 #: Public attributes of a verdict that are numbers.
-NUMBERS = ("success", "p_OQ", "nhat_Q_O", "surface_distance", "epsilon")
+NUMBERS = ("matches", "p_OQ", "nhat_Q_O", "surface_distance", "epsilon")
 #: An array of more numbers, as of images, is compared by means on other machines.
 LARGE = 10_000
 #: Simulated numbers of other machines are as near as this: metres, radians, newtons, shares.

@@ -40,7 +40,7 @@ def write_predictions(out: Path, path: Path) -> Path:
             for name in ("X_OG", "closed_q", "closed_p_OQ", "closed_nhat_Q_O", "closed_f_Q_O"):
                 columns[name][i] = true[name][i]
             columns["contact_error"][i] = [error, 0.0, 0.0]
-    for name in ("held", "success", "held_any"):
+    for name in ("lifted", "matches", "lifted_any"):
         if name in columns:
             columns[name][:] = columns["outcome"] == Outcome.SUCCESS
     columns["precision"][:] = [True, False, False, False]

@@ -15,12 +15,12 @@ from drakegrasp.simulation.attempts import GraspRows
 
 FAILS = Verdict(
     outcome="dropped",
-    success=False,
-    held=False,
+    matches=False,
+    lifted=False,
     precision=False,
     stable=False,
-    sample=False,
-    held_any=False,
+    kept=False,
+    lifted_any=False,
     contact_error=None,
     penetration=None,
     posture=(),
@@ -29,12 +29,12 @@ FAILS = Verdict(
 
 
 def verdict(word: str, error: float = 0.004, confidence: float = 0.0) -> Verdict:
-    """Return a verdict: "sample", "held" or "fails"; held ones count within 20 mm."""
+    """Return a verdict: "kept", "lifted" or "fails"; lifted ones count within 20 mm."""
     if word == "fails":
         return FAILS
-    held = FAILS.__dict__ | {"outcome": "success", "held": True, "held_any": True}
-    held |= {"success": error <= 0.02, "contact_error": error, "penetration": 0.001}
-    return Verdict(**(held | ({"sample": True, "precision": True} if word == "sample" else {})))
+    lifted = FAILS.__dict__ | {"outcome": "success", "lifted": True, "lifted_any": True}
+    lifted |= {"matches": error <= 0.02, "contact_error": error, "penetration": 0.001}
+    return Verdict(**(lifted | ({"kept": True, "precision": True} if word == "kept" else {})))
 
 
 class Rows:
@@ -89,18 +89,18 @@ class FakeVerify:
             if self.stop_after is not None and index == self.stop_after:
                 raise KeyboardInterrupt
             self.asked += 1
-            held = self.holds(grasp)
+            lifted = self.holds(grasp)
             found: Any = SimpleNamespace(
                 grasp=SimpleNamespace(postures=()),
-                outcome=SimpleNamespace(label="success" if held else "dropped"),
-                success=held,
-                held=held,
-                precision=held,
-                stable=held,
-                sample=held,
-                held_any=held,
+                outcome=SimpleNamespace(label="success" if lifted else "dropped"),
+                matches=lifted,
+                lifted=lifted,
+                precision=lifted,
+                stable=lifted,
+                kept=lifted,
+                lifted_any=lifted,
                 first=None,
-                farthest_contact=0.001 if held else np.nan,
+                farthest_contact=0.001 if lifted else np.nan,
                 seconds={"simulate": 0.5},
             )
             on_result(index, verdict_of(found))

@@ -24,7 +24,7 @@ def good(count: int) -> Table:
         resting=np.zeros(count, dtype=np.uint8),
         X_OG=np.tile(np.eye(4), (count, 1, 1)),
         grasp_T=rng.normal(size=(count, 18)),
-        held_O=rng.normal(size=(count, 18)),
+        lifted_O=rng.normal(size=(count, 18)),
         complete=np.ones(count, dtype=bool),
         unused=np.zeros((count, 3), dtype=bool),
         other_links=np.zeros(count, dtype=np.uint8),

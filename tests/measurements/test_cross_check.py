@@ -103,7 +103,7 @@ def test_dataset_without_lifts_is_refused(dataset, tmp_path):
     out = make_dataset(tmp_path / "data", tmp_path)
     with h5py.File(out / TRIALS, "r+") as file:
         file["trials/outcome"][:] = Outcome.RAY_MISS
-    with pytest.raises(DataError, match="got one in which nothing was lifted"):
+    with pytest.raises(DataError, match="got one in which no lift was tried"):
         draw_lifts(out, 5)
 
 
@@ -117,8 +117,8 @@ def test_dataset_without_trials_is_refused(dataset, tmp_path):
 
 
 def test_agreement_counts_what_is_lifted_there():
-    def row(there, lifted):
-        return {"there": there.label, "lifted": lifted}
+    def row(there, tried):
+        return {"there": there.label, "tried": tried}
 
     rows = [
         *[row(Outcome.SUCCESS, True)] * 3,
@@ -127,14 +127,14 @@ def test_agreement_counts_what_is_lifted_there():
         row(Outcome.TABLE_CONTACT, False),
     ]
     found = agreement(rows)
-    assert (found["drawn"], found["lifted"], found["held"]) == (7, 4, 3)
-    assert found["not_lifted"] == {"missing_fingertip": 2, "table_contact": 1}
-    for of, count in (("of_all", 7), ("of_lifted", 4)):
+    assert (found["drawn"], found["tried"], found["lifted"]) == (7, 4, 3)
+    assert found["not_tried"] == {"missing_fingertip": 2, "table_contact": 1}
+    for of, count in (("of_all", 7), ("of_tried", 4)):
         share = found[of]
         assert share["share"] == 3 / count
         assert (share["low"], share["high"]) == binomtest(3, count).proportion_ci(method="wilson")
     assert agreement(rows[4:])["of_all"]["share"] == 0.0
-    assert agreement(rows[4:])["of_lifted"] is None
+    assert agreement(rows[4:])["of_tried"] is None
     assert agreement([])["of_all"] is None
 
 

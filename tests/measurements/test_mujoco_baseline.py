@@ -54,7 +54,7 @@ def test_cube_is_held_across_its_faces(baseline: MujocoBaseline, cube: ObjectMod
     attempt = from_above(cube, STANDOFF)
     first, again = baseline.run(attempt), baseline.run(attempt)
     assert first.outcome is Outcome.SUCCESS
-    assert first.lifted
+    assert first.tried
     assert again == first  # nothing is left of the first run
 
 
@@ -65,7 +65,7 @@ def test_attempts_fail_where_they_should(
     baseline: MujocoBaseline, cube: ObjectModel, standoff: float, outcome: Outcome
 ) -> None:
     trial = baseline.run(from_above(cube, standoff))
-    assert (trial.outcome, trial.lifted) == (outcome, False)
+    assert (trial.outcome, trial.tried) == (outcome, False)
 
 
 def test_what_geometry_decides_is_not_simulated(
@@ -81,7 +81,7 @@ def test_what_geometry_decides_is_not_simulated(
 def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
     slick = override_config(config, ["physics.friction_hand=0.05"])
     trial = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
-    assert trial.lifted
+    assert trial.tried
     assert trial.outcome in (Outcome.DROPPED, Outcome.SLIPPED, Outcome.PARTLY_HELD)
 
 

@@ -51,7 +51,7 @@ def test_the_worst_come_first(client: TestClient) -> None:
         ("verdict=precision", ["0"]),
         ("outcome=dropped", ["3"]),
         ("object=nothing", []),
-        ("class=box&verdict=held", ["1", "0"]),
+        ("class=box&verdict=lifted", ["1", "0"]),
     ],
 )
 def test_filters_choose(client: TestClient, query: str, numbers: list[str]) -> None:
@@ -155,7 +155,7 @@ def test_a_field_that_a_file_lacks_is_a_dash(out: Path, results: Path) -> None:
         for name in set(file["grasps"]) - {"object", "outcome", "p_OQ", "nhat_Q_O"}:
             del file[f"grasps/{name}"]
     client = open_pages(out, results)
-    assert shown(client, "verdict=held") == ["0", "1"]
+    assert shown(client, "verdict=lifted") == ["0", "1"]
     assert "4.0 mm" in client.get("/prediction/0").text  # from the true contact
     assert client.get("/prediction/0").text.count("<td>–</td>") > 10
 

@@ -53,16 +53,16 @@ def label_of(card: str) -> str:
 
 def test_gallery_counts_the_grasps_of_each_scene(client: TestClient, made: Path) -> None:
     with h5py.File(made / "scenes.hdf5") as file:
-        scene, sample = file["grasps/scene"][:], file["grasps/sample"][:]
+        scene, kept = file["grasps/scene"][:], file["grasps/kept"][:]
         counts = np.bincount(scene), np.bincount(scene[file["grasps/tested"][:]], minlength=3)
     found = cards(client, "sort=row&order=up")
     for i, card in enumerate(found):
         grasps, tested, _, samples = map(int, re.findall(r"<dd>(\d+)</dd>", card))
         assert (grasps, tested) == (counts[0][i], counts[1][i])
-        assert samples == (sample & (scene == i)).sum()
+        assert samples == (kept & (scene == i)).sum()
     assert len(found) == 3 and max(counts[0]) > max(counts[1]) > 0
     # The first have the most samples, and ties are in the order of the file.
-    best = np.argsort(-np.bincount(scene[sample], minlength=3), kind="stable")
+    best = np.argsort(-np.bincount(scene[kept], minlength=3), kind="stable")
     assert [label_of(card) for card in cards(client)] == [label_of(found[i]) for i in best]
 
 
@@ -83,7 +83,7 @@ def test_views_show_what_the_file_says_of_contacts(client: TestClient, made: Pat
     with h5py.File(made / "scenes.hdf5") as file:
         views = np.flatnonzero(file["views/scene"][:] == 0)
         grasps = np.flatnonzero(file["grasps/scene"][:] == 0)
-        first = grasps[np.argmax(file["grasps/sample"][:][grasps])]
+        first = grasps[np.argmax(file["grasps/kept"][:][grasps])]
         pairs, seen = file["visible"], file["visible/visible"][:]
         own = pairs["grasp"][:] == first
         hidden = [(~seen[own & (pairs["view"][:] == view)]).sum() for view in views]
@@ -104,19 +104,21 @@ def test_page_shows_the_best_hands_first_and_all_palms(client: TestClient, made:
     scene = json.loads(text)["scene"]
     with h5py.File(made / "scenes.hdf5") as file:
         own = file["grasps/scene"][:] == 0
-        held, tested, trial = (file["grasps"][n][:][own] for n in ("held", "tested", "trial_id"))
+        lifted, tested, trial = (
+            file["grasps"][n][:][own] for n in ("lifted", "tested", "trial_id")
+        )
         p_TG = file["grasps/X_TG"][:][own].reshape(-1, 3, 4)[:, :, 3]
         points = file["grasps/p_TQ"][:][own]
     colours = [palm["colour"] for palm in scene["palms"]]
-    counts = [held.sum(), (tested & ~held).sum(), (~tested).sum()]
+    counts = [lifted.sum(), (tested & ~lifted).sum(), (~tested).sum()]
     looks = zip((HOLDS, FAILS, UNKNOWN), counts, strict=True)
     wanted = [look[2] for look, count in looks for _ in range(count)]
     assert colours == wanted and len(set(colours)) > 1
     assert sorted(palm["p"] for palm in scene["palms"]) == sorted(p_TG.astype(float).tolist())
     # The hands are those of the file, and a link leads to the page of the best.
-    state = scene["states"][f"trial {trial[np.argmax(held)]}"]
+    state = scene["states"][f"trial {trial[np.argmax(lifted)]}"]
     found = [contact["p"] for contact in state["contacts"]]
-    assert found == points[np.argmax(held)].astype(float).tolist() and len(state["links"]) > 5
+    assert found == points[np.argmax(lifted)].astype(float).tolist() and len(state["links"]) > 5
     (link,) = [
         a["href"] for tag, a in Tags(page).tags if tag == "a" and "/grasp/" in str(a["href"])
     ]

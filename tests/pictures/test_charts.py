@@ -30,14 +30,17 @@ def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:
 def test_panels_of_a_card_state_what_they_draw(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drakegrasp.pictures.charts.png_bytes", lambda figure, dpi: figure)
     each = {
-        "measures": {"headline": {"value": 0.5, "low": 0.25, "high": 0.75}, "held": {"value": 0.6}},
-        "held_within_mm": {"0": 0.0, "20": 0.5, "40": 0.6},
+        "measures": {
+            "headline": {"value": 0.5, "low": 0.25, "high": 0.75},
+            "lifted": {"value": 0.6},
+        },
+        "lifted_within_mm": {"0": 0.0, "20": 0.5, "40": 0.6},
         "calibration": [{"confidence": 0.1, "share": 0.2}, {"confidence": 0.9, "share": 0.7}],
     }
     card = {
         "sets": {"net": each},
         "headline": ["net"],
-        "measures": ["held"],
+        "measures": ["lifted"],
         "limit_mm": 20.0,
         "rows": 8,
         "objects": 2,

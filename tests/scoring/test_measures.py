@@ -35,25 +35,25 @@ def of_verdicts(*verdicts, **stated):
 
 
 def test_an_object_with_many_rows_counts_no_more_than_another():
-    rows = [["sample"], ["fails"], ["fails"], ["fails"], ["sample"], ["sample"]]
+    rows = [["kept"], ["fails"], ["fails"], ["fails"], ["kept"], ["kept"]]
     found = estimated(judged("net", rows), 0, 0, 0, 0, 1, 2)
     assert found["headline"]["value"] == pytest.approx((0.25 + 1 + 1) / 3, abs=1e-6)
     assert found["objects"]["value"] == 1.0
-    assert "held_any" not in found
+    assert "lifted_any" not in found
 
 
 @pytest.mark.parametrize(
     ("measure", "rows"),
-    [("headline", [1, 0, 0]), ("sample", [1, 1, 0]), ("success", [1, 0, 1]), ("held", [1, 1, 1])],
+    [("headline", [1, 0, 0]), ("kept", [1, 1, 0]), ("matches", [1, 0, 1]), ("lifted", [1, 1, 1])],
 )
 def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for(measure, rows):
-    one = of_verdicts(verdict("sample"), verdict("sample", error=0.03), verdict("held"))
+    one = of_verdicts(verdict("kept"), verdict("kept", error=0.03), verdict("lifted"))
     # A row without prediction fails.
     assert grouping(0, 1, 2, 3).best_of_rows(one, one.table[measure]).tolist() == [[*rows, 0]]
 
 
 def test_the_k_best_of_a_row_count_in_success_at_k_only():
-    rows = [["fails", "sample", "fails"], ["fails", "fails", "sample"], ["sample"] * 3]
+    rows = [["fails", "kept", "fails"], ["fails", "fails", "kept"], ["kept"] * 3]
     found = estimated(judged("net", rows), 0, 1, 2)
     assert found["headline"]["value"] == pytest.approx(1 / 3, abs=1e-6)
     assert found["success@2"]["value"] == pytest.approx(2 / 3, abs=1e-6)
@@ -61,7 +61,7 @@ def test_the_k_best_of_a_row_count_in_success_at_k_only():
 
 
 def test_intervals_are_of_objects_and_come_again():
-    one = judged("net", [["sample"], ["fails"], ["fails"]])
+    one = judged("net", [["kept"], ["fails"], ["fails"]])
     found = estimated(one, 0, 1, 2)["headline"]
     assert (found["low"], found["high"]) == (0.0, 1.0)
     assert estimated(one, 0, 1, 2)["headline"] == found
@@ -79,7 +79,7 @@ def test_objects_of_a_class_are_drawn_together():
 
 def test_a_difference_is_paired_by_object():
     """Two equal sets differ by nothing in every resample, however wide their own intervals are."""
-    one = judged("net", [["sample"], ["fails"], ["fails"]])
+    one = judged("net", [["kept"], ["fails"], ["fails"]])
     same = difference(one, one, grouping(0, 1, 2), DRAWS)
     assert (same["value"], same["low"], same["high"]) == (0.0, 0.0, 0.0)
     less = judged("other", [["fails"], ["fails"], ["fails"]])
@@ -89,14 +89,14 @@ def test_a_difference_is_paired_by_object():
 
 
 def test_training_seeds_widen_the_interval():
-    good, bad = [["sample"]] * 3, [["fails"]] * 3
+    good, bad = [["kept"]] * 3, [["fails"]] * 3
     one = estimated(judged("net", good, bad), 0, 1, 2)["headline"]
     assert (one["value"], one["low"], one["high"]) == (0.5, 0.0, 1.0)
 
 
 def test_training_seeds_of_both_sets_widen_a_difference():
     """Drawn apart: the better seeds of one may meet the worse of the other."""
-    good, bad = [["sample"]] * 3, [["fails"]] * 3
+    good, bad = [["kept"]] * 3, [["fails"]] * 3
     spread = judged("spread", good, bad)
     for one, other in ((spread, judged("bad", bad)), (judged("good", good), spread)):
         found = difference(one, other, grouping(0, 1, 2), DRAWS)
@@ -106,27 +106,25 @@ def test_training_seeds_of_both_sets_widen_a_difference():
 
 
 def test_the_curve_rises_with_the_distance():
-    one = of_verdicts(verdict("held", error=0.012), verdict("held", error=0.05))
+    one = of_verdicts(verdict("lifted", error=0.012), verdict("lifted", error=0.05))
     assert curve(one, grouping(0, 1)) == [0.0] * 3 + [0.5] * 7 + [1.0] * 3
 
 
 def test_calibration_groups_by_confidence():
-    words = ["fails"] * 5 + ["sample"] * 5
+    words = ["fails"] * 5 + ["kept"] * 5
     groups = calibration(of_verdicts(*map(verdict, words), confidence=np.arange(10) / 10))
     assert [group["share"] for group in groups] == [0, 0, 0.5, 1, 1]
-    assert calibration(judged("net", [["sample"]])) == []
+    assert calibration(judged("net", [["kept"]])) == []
 
 
 def test_diversity_is_one_along_a_line_and_falls_with_directions():
     def variance(postures):
-        return diversity(
-            of_verdicts(*(replace(verdict("sample"), posture=(*p,)) for p in postures))
-        )
+        return diversity(of_verdicts(*(replace(verdict("kept"), posture=(*p,)) for p in postures)))
 
     assert variance(np.outer([0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 0.0]))[0] == 1.0
     assert variance(np.eye(4))[0] == pytest.approx(1 / 3, abs=1e-6)
 
 
 def test_classes_are_means_of_their_objects():
-    one, rows = judged("net", [["sample"], ["fails"], ["fails"]]), grouping(0, 0, 1)
+    one, rows = judged("net", [["kept"], ["fails"], ["fails"]]), grouping(0, 0, 1)
     assert by_name(one, rows, rows.classes) == {"class 0": 0.5, "class 1": 0.0}

@@ -133,7 +133,7 @@ def test_own_samples_given_back_as_postures_come_out_as_stored(small_dataset, tm
     assert first.reason == "the palm's pose must be within 1000 m, got 1e+06 m"
     stored = Trials(small_dataset)
     chosen = data.column("trial_id")[rows]
-    assert all(verdict.held and verdict.sample and verdict.success for verdict in others)
+    assert all(verdict.lifted and verdict.kept and verdict.matches for verdict in others)
     assert [verdict.stable for verdict in others] == stored["stable"][chosen].tolist()
     reached = np.array([verdict.posture for verdict in others])[:, 6:]
     np.testing.assert_allclose(reached, stored["closed_q"][chosen], atol=1e-3)

@@ -45,8 +45,8 @@ def test_grasps_come_with_the_best_first(cloud):
 def test_lifts_end_at_the_first_grasp_that_holds_in_all_of_them(cloud, view):
     proposed = dg.propose(cloud)
     seen = dg.rank(proposed, cloud, simulate=8, view=view, config=CONFIG)
-    lifted = np.argsort(-seen.score, kind="stable")[: np.isfinite(seen.share).sum()]
-    assert set(lifted) == set(np.flatnonzero(np.isfinite(seen.share)))
+    tried = np.argsort(-seen.score, kind="stable")[: np.isfinite(seen.share).sum()]
+    assert set(tried) == set(np.flatnonzero(np.isfinite(seen.share)))
     assert (
         seen.share[seen.order[0]] == 1.0
         and np.nanmax(np.delete(seen.share, seen.order[0]), initial=0.0) < 1.0

@@ -62,8 +62,8 @@ def test_words_and_sentences_follow_from_slip_turn_and_other_links(
     slip_mm, turn_deg, links, stable, said
 ):
     verdict = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links)
-    assert verdict.held is verdict.success is True
-    assert (verdict.precision, verdict.stable, verdict.sample) == (not links, stable, not links)
+    assert verdict.lifted is verdict.matches is True
+    assert (verdict.precision, verdict.stable, verdict.kept) == (not links, stable, not links)
     assert repr(verdict) == "Verification(success: so it is)"
     text, load = verdict.explain(), "1.0 N, 0.1 times the hand's rated load of 19.6 N."
     moved = f"slips by {slip_mm:.1f} mm and turns by {turn_deg:.1f}° in the hand"
@@ -74,13 +74,13 @@ def test_words_and_sentences_follow_from_slip_turn_and_other_links(
 
 def test_grasp_that_fails_is_none_of_the_words_and_gets_no_mark():
     verdict = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED)
-    assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
+    assert (verdict.lifted, verdict.precision, verdict.stable) == (False, False, False)
     text = verdict.explain()
     assert text.startswith("The grasp of vase fails (dropped): so it is. ")
     assert text.endswith("touches it; 3 of 3 fingertips still touch it.")
     # What was not lifted is nothing, either.
     verdict = replace(verdict, tries=(), outcome=Outcome.INVALID)
-    assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
+    assert (verdict.lifted, verdict.precision, verdict.stable) == (False, False, False)
     assert "slips" not in verdict.explain()
 
 
@@ -92,7 +92,7 @@ def test_explanation_says_whether_it_is_a_sample_and_what_is_not_judged(removal,
     verdict = lifted(slip_mm=0.1, turn_deg=0.1, links=0)
     verdict = replace(verdict, tries=(replace(verdict.tries[0], removal=removal),))
     text = verdict.explain()
-    assert verdict.sample is (removal is Removal.KEPT)
+    assert verdict.kept is (removal is Removal.KEPT)
     assert f"In a dataset {said} not judged: not_seen, flat_depth, outlier." in text
 
 
@@ -104,11 +104,11 @@ def test_hints_and_normalised_normals_are_told():
     assert text.endswith("This would fit much better: points in millimetres instead of metres.")
 
 
-def test_held_within_a_distance_follows_from_the_farthest_contact():
+def test_lifted_within_a_distance_follows_from_the_farthest_contact():
     verdict = lifted(slip_mm=0.1, turn_deg=0.1, links=0)
     error = np.array([0.003, np.nan, 0.019])
     near = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error),))
-    assert near.farthest_contact == 0.019 and near.success
+    assert near.farthest_contact == 0.019 and near.matches
     far = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error + 0.002),))
-    assert far.held and not far.success
+    assert far.lifted and not far.matches
     assert "fingertip 3 is more than 20.0 mm from its point" in far.explain()

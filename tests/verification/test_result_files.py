@@ -104,8 +104,8 @@ def test_a_line_says_all_of_a_grasp_in_strict_json(found):
     expected = {
         "index": [0, 1, 2],
         "outcome": ["success", "missing_fingertip", "invalid"],
-        "success": [True, False, False],
-        "sample": [True, False, False],
+        "matches": [True, False, False],
+        "kept": [True, False, False],
         "removal": ["kept", None, None],
         "unjudged": [["not_seen", "flat_depth", "outlier"], [], []],
         "outcomes": [["success", "missing_fingertip"], ["missing_fingertip"], []],
@@ -147,11 +147,11 @@ def test_every_field_is_written_and_reads_back(found, tmp_path):
         assert json.loads(file.attrs["config"]) == CONFIG.to_dict()
         assert json.loads(file.attrs["versions"])["drake"]
     assert columns["outcome"].tolist() == [0, 5, 17]
-    assert columns["held_any"].tolist() == [True, False, False]
+    assert columns["lifted_any"].tolist() == [True, False, False]
     assert columns["tries"].tolist() == [2, 1, 0]
     assert columns["rank"].tolist() == [2, -1, -1]
     assert columns["contact_error"][0].tolist() == [0.001, 0.002, 0.003]
-    for name in ("p_OQ", "nhat_Q_O", "surface_distance", "success"):
+    for name in ("p_OQ", "nhat_Q_O", "surface_distance", "matches"):
         assert np.array_equal(columns[name], [getattr(v, name) for v in found], equal_nan=True)
     closed = found[0].trial.closed
     assert np.array_equal(columns["X_OG"][0], pack_pose(X_OG))

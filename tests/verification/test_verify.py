@@ -69,7 +69,7 @@ def held(cube, grasp):
 
 
 def test_a_grasp_that_held_is_found_again_and_holds(held):
-    assert held.success and held.outcome is Outcome.SUCCESS
+    assert held.matches and held.outcome is Outcome.SUCCESS
     assert held.fit is not None and held.fit.residual.max() < 0.003
     assert np.rad2deg(held.fit.normal_error).max() < 15.0
     assert held.contact_error is not None and held.contact_error.max() < 0.005
@@ -106,15 +106,15 @@ def test_contacts_in_the_air_are_tried_and_told(cube, grasp):
     p, n = grasp
     found = verify(cube, p + 0.03 * n, n)
     np.testing.assert_allclose(found.surface_distance, 0.03, atol=1e-4)
-    assert found.held and not found.success
+    assert found.lifted and not found.matches
     assert found.farthest_contact == pytest.approx(0.03, abs=1e-3)
-    assert "It is not a success: fingertip" in found.explain()
+    assert "It does not match its request: fingertip" in found.explain()
 
 
 def test_normals_that_point_inwards_are_tried_and_get_a_hint(cube, grasp):
     p, n = grasp
     found = verify(cube, p, -n)
-    assert not found.success and found.trial is not None
+    assert not found.matches and found.trial is not None
     assert found.hints == ("normals that point the other way, out of the object",)
     assert found.explain().endswith(f"This would fit much better: {found.hints[0]}.")
 
@@ -180,7 +180,7 @@ def test_misplaced_points_are_told_first_with_where_they_would_fit(
     numbers = dg.transform_grasp(X_FO, dg.pack_grasp(*grasp))
     numbers[:9] *= factor
     found = dg.verify_grasp(numbers, dg.place_object(cube, X_TO=X_TO), **given)
-    assert found.misplaced and not found.success
+    assert found.misplaced and not found.matches
     distance = 1e3 * found.surface_distance
     text = found.explain()
     assert f"{distance.max():.1f} mm off the object" in text.split(". ")[0]
@@ -195,7 +195,7 @@ def test_one_point_in_the_air_is_told(cube, grasp):
     p, n = grasp[0].copy(), grasp[1]
     p[1] += 0.012 * n[1]
     found = verify(cube, p, n)
-    assert found.held and found.misplaced and found.hints == ()
+    assert found.lifted and found.misplaced and found.hints == ()
     text = found.explain()
     assert text.startswith("1 of 3 points lies 12.0 mm off the object, so the requested grasp")
     assert "After closing, the fingertips touch" in text
@@ -205,7 +205,7 @@ def test_one_point_in_the_air_is_told(cube, grasp):
 def test_invalid_row_is_a_verdict_without_a_trial(cube):
     found = verify(cube, np.full((3, 3), np.nan), np.eye(3))
     assert found.outcome is Outcome.INVALID and not found.outcome.inconclusive
-    assert not (found.success or found.held or found.held_any or found.sample)
+    assert not (found.matches or found.lifted or found.lifted_any or found.kept)
     assert found.tries == () and found.fit is None and np.isnan(found.surface_distance).all()
     assert found.explain() == "The grasp of 1_cube_a fails (invalid): number 1 is nan, not finite."
 
@@ -257,8 +257,8 @@ def test_first_wrist_pose_decides_and_the_others_are_an_oracle(
     held, monkeypatch, ends, most, tries, by
 ):
     found = tried(held, monkeypatch, ends, most)
-    assert (found.outcome, found.num_tries, found.held_by) == (ends[0], tries, by)
-    assert found.success == (by == 0) and found.held_any == (by is not None)
+    assert (found.outcome, found.num_tries, found.lifted_by) == (ends[0], tries, by)
+    assert found.matches == (by == 0) and found.lifted_any == (by is not None)
     assert [each.trial.outcome for each in found.tries] == ends[:tries]
     if by:
         assert f"number {by + 1} of {tries} does" in found.explain()
@@ -312,7 +312,7 @@ def _fail(scene):
 
 
 def test_results_know_what_they_were_asked(held, cube):
-    assert held.placed is cube and held.precision and held.stable and held.sample
+    assert held.placed is cube and held.precision and held.stable and held.kept
     # The fingers were opened before they closed.
     assert np.all(held.pregrasp.closing < held.fit.closing)
     assert (X_WT @ cube.X_TO @ held.pregrasp.X_OG)[2, 3] > 0.65
