@@ -19,6 +19,7 @@ from helpers.successes import good, judge
 
 from drakegrasp import registry
 from drakegrasp.cluster.kinds import cluster_of
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset, read_closed_grasps
@@ -113,6 +114,11 @@ def test_what_is_exported_is_imported(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.X_FG, X_OG, atol=1e-12)
         np.testing.assert_array_equal(found.q_grasp, [grasp.q for grasp in grasps])
         assert not any(found.invalid)
+        # A format that states no frame is read for the rows of a split, too.
+        data = GraspDataset(out / "grasping_oto.hdf5", split="train")
+        assert len(data) < count
+        rows = read_attempts(source, load_hand("barrett"), of=data).of_row
+        assert set(rows.tolist()) == set(range(len(data)))
     path.write_text("no JSON")
     with pytest.raises(GraspError, match=r"samples\.palms: must be readable by the importer"):
         read_attempts(path, load_hand("barrett"))

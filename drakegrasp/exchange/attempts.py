@@ -330,7 +330,7 @@ def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
     """
     told, column = raw["objects"], "object_props/object_name"
     of_objects = raw.get("of_objects") or (
-        all(told) and len(told) != len(data) and "trial" not in raw and raw["frame"] != "camera"
+        all(told) and len(told) != len(data) and "trial" not in raw and raw.get("frame") != "camera"
     )
     if raw.get("of_row") is not None or not (of_objects or "trial" in raw):
         return raw
