@@ -21,7 +21,7 @@ from drakegrasp.dataset import quality
 from drakegrasp.dataset.hdf5 import AnyArray, read_columns
 from drakegrasp.dataset.schema import CAMERAS, LOOK_FIELDS, TRIAL_FIELDS, with_derived
 from drakegrasp.errors import ConfigError, listed
-from drakegrasp.filters import Filter, Flags, Removal, first_removal, is_outlier
+from drakegrasp.filters import NEEDED, Filter, Flags, Removal, first_removal, is_outlier
 from drakegrasp.frames import Array, invert_pose, unpack_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.registry import own_class, run_own
@@ -29,7 +29,10 @@ from drakegrasp.table import Table
 from drakegrasp.vision.camera import intrinsics, project
 
 #: Columns of `/trials` that are copied: the identity of the attempt, and values of filters.
-COPIED = ("candidate", "standoff_index", "resting", "slip", "turn", "slip_use")
+COPIED = (
+    *("candidate", "standoff_index", "resting"),
+    *(field.name for field in TRIAL_FIELDS if field.name in NEEDED),
+)
 #: Columns of `/trials` and of `/looks` that `successes_of` reads.
 _OF_TRIALS = (
     *COPIED,

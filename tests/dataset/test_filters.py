@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import h5py
 import numpy as np
 import pytest
 from helpers.successes import good, judge
@@ -9,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.filters import Removal, is_outlier
+from drakegrasp.dataset.successes import shard_successes, successes_of
+from drakegrasp.filters import NEEDED, Removal, is_outlier
+from drakegrasp.hand.settings import load_config
 
 
 def test_first_reason_counts() -> None:
@@ -169,3 +174,11 @@ def test_no_finger_that_is_used_may_come_near_its_cone() -> None:
     assert np.all(judge(successes, FilterConfig()) == Removal.KEPT)
     removal = judge(successes, FilterConfig(max_slip_use=0.8))
     assert removal.tolist() == [Removal.NEAR_CONE, Removal.KEPT, Removal.NEAR_CONE, Removal.KEPT]
+
+
+def test_successes_have_every_column_that_a_filter_needs(sound: Path) -> None:
+    """A filter without its column would be left out without a word."""
+    (path, *_) = sorted(sound.glob("shards/*/*.h5"))
+    with h5py.File(path) as file:
+        successes = successes_of(shard_successes(file), load_config())
+    assert {*NEEDED} <= {*successes.names}
