@@ -137,8 +137,9 @@ class Gallery(ABC):
     # Methods that a table may override.
 
     def column(self, name: str) -> AnyArray:
-        """Return a column (n,), or the order of the rows if the table has no such column."""
-        return self.table[name] if name in self.table else np.arange(self.table.count)
+        """Return a column (n,); `row` is the order of the rows if the table has no such column."""
+        is_order = name == "row" and name not in self.table
+        return np.arange(self.table.count) if is_order else self.table[name]
 
     def matches(self, name: str, value: str) -> npt.NDArray[np.bool_]:
         """Return which rows (n,) have a value of a choice."""
