@@ -108,10 +108,10 @@ def test_hand_of_another_package_is_used_by_its_name(monkeypatch: pytest.MonkeyP
 
 def test_a_dataset_opens_where_its_sampler_and_its_rule_are_not_installed() -> None:
     tree = load_config().to_dict()
-    tree["candidates"]["method"] = ["ring", "normals"]
+    tree["candidates"]["method"] = ["absent", "normals"]
     tree["filters"]["own"] = ["calm"]
     config = parse_stored(tree)
-    assert config.candidates.method == ("ring", "normals")
+    assert config.candidates.method == ("absent", "normals")
     assert config.filters.own == ("calm",)
     with pytest.raises(ConfigError, match=r"candidates\.method: must be one of rotations"):
         parse_config(tree)

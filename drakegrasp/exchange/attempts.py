@@ -337,7 +337,7 @@ def _of_split(raw: dict[str, Any], data: GraspDataset) -> dict[str, Any]:
     if not of_objects:
         if raw["trial"] is None:
             return raw
-        told, column = raw["trial"].tolist(), "trial_id"
+        told, column = np.asarray(raw["trial"]).tolist(), "trial_id"
 
     # Repeat each posture for each of its rows.
     rows_of = dict[Any, list[int]]()

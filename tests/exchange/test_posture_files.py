@@ -494,7 +494,7 @@ def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.csv", "x,y\n1,2\n", r"must be a file of postures \(\.npz"),
+        ("a.xyz", "x,y\n1,2\n", r"must be a file of postures \(\.npz"),
         ("a.npz", "junk", "must be a readable file of arrays"),
         ("a.npz", "", "must be a readable file of arrays"),
         ("a.npz", "PK\3\4", "must be a readable file of arrays"),

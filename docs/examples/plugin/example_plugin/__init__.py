@@ -84,4 +84,5 @@ class Half(Local):
 
     def connected(self, out):
         """Return what starts the workers when it is entered."""
-        return connect(max(1, (os.cpu_count() or 1) // 2), memory=self.memory)
+        half = max(1, (os.cpu_count() or 1) // 2)
+        return connect(half, tls=self.tls, tls_files=self.tls_files, memory=self.memory)
