@@ -172,7 +172,9 @@ def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
     with pytest.raises(DataError, match=r"/outcome must be one of 0, 1, .*, 18, got 16 in row 7"):
         Trials(out)[[7, 9]]["outcome"]
     edit_file(out / TRIALS, lambda f: f["successes/removal"].write_direct(np.full(9, 14, "u1")))
-    with pytest.raises(DataError, match=rf"/removal must be one of 0, 1, .*, {max(Removal)}, got 14 in row 0"):
+    with pytest.raises(
+        DataError, match=rf"/removal must be one of 0, 1, .*, {max(Removal)}, got 14 in row 0"
+    ):
         Trials(out)["removal"]
     edit_file(out / TRIALS, lambda f: f["trials/object"].write_direct(np.full(36, 3, "i4")))
     with pytest.raises(DataError, match="/trials/object must be 0 to 2, got 3 in row 0"):
