@@ -23,7 +23,6 @@ import drakegrasp as dg
 from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.hand.description import load_hand
-from drakegrasp.simulation.posture import joint_order
 
 # Where torch is said to be there, a test that skips is a failure.
 if os.environ.get("DRAKEGRASP_TORCH") != "1":
@@ -170,7 +169,7 @@ def test_closing_ranks_a_networks_proposals_with_grasps_from_above() -> None:
     x, y = np.meshgrid(np.linspace(-0.05, 0.05, 30), np.linspace(-0.025, 0.025, 15))
     cloud = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.08)])
     hand = load_hand()
-    joints = joint_order(hand)[::-1]
+    joints = hand.joint_order[::-1]
     inside = np.diag([1.0, -1.0, -1.0, 1.0])[None]
     q = np.zeros((1, len(joints)))
     own = predict.Choice(inside, q, q, np.ones(1))

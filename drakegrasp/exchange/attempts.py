@@ -53,7 +53,6 @@ from drakegrasp.simulation.attempts import (
     read_confidence,
     taken,
 )
-from drakegrasp.simulation.posture import joint_order
 from drakegrasp.verification.prediction import ContactRows, choose_rows, read_grasps, read_several
 
 #: Values that a file states once for all its rows.
@@ -232,7 +231,7 @@ def write_attempts(path: Path, table: GraspTable, hand: Hand) -> None:
         raise GraspError(f"postures must be valid to be written: {bad}")
     texts = {
         "object": table.objects,
-        "joints": joint_order(hand),
+        "joints": hand.joint_order,
         "source": table.said,
         "preshape": table.preshape if any(table.preshape) else None,
     }

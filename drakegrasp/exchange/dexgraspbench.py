@@ -53,7 +53,7 @@ from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.simulation.attempts import quaternion_poses
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import Posture, joint_order
+from drakegrasp.simulation.posture import Posture
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.verify import first_fit
 
@@ -305,7 +305,7 @@ def write_grasps(
     """
     # Write the hand; find the index of its spread joint.
     files = BenchFiles(hand, folder)
-    spread = joint_order(hand).index(hand.spread.joints[0]) if hand.spread.joints else None
+    spread = hand.joint_order.index(hand.spread.joints[0]) if hand.spread.joints else None
 
     # Write each object once.
     things = (placed.model for placed, posture in grasps if isinstance(posture, Posture))
@@ -373,4 +373,4 @@ def _fit(task: tuple[int, PlacedGrasp]) -> tuple[int, Posture]:
     number, grasp = task
     fit, hand = first_fit(grasp), load_hand(grasp.config.hand_source)
     named = joint_positions(hand, fit.spread, fit.closing)
-    return number, Posture(fit.X_OG, np.array([named[name] for name in joint_order(hand)]))
+    return number, Posture(fit.X_OG, np.array([named[name] for name in hand.joint_order]))

@@ -27,7 +27,6 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.runtime.progress import Report
 from drakegrasp.simulation.attempts import CONDITIONS, quaternion_poses
-from drakegrasp.simulation.posture import joint_order
 from drakegrasp.yaml_text import parse_yaml
 
 #: Value with which our files state their origin.
@@ -65,7 +64,7 @@ def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
 
 def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
     """Return the entry of a sample in the file."""
-    order = joint_order(hand)
+    order = hand.joint_order
     X_OB = multiply(multiply(invert_pose(grasp.X_TO), grasp.X_TG), invert_pose(hand.X_BG))
     closed = dict(zip(order, grasp.q.tolist(), strict=True))
 

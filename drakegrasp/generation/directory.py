@@ -31,7 +31,6 @@ from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import ConfigError, DataError, counted, listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.folder import carry_hand, hand_places, moved_hand
-from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.simulation.candidates import validate_samplers
@@ -154,7 +153,7 @@ def _manifest(config: Config, known: Manifest | None) -> Manifest:
     return replace(
         known or Manifest(config=config, versions=versions, fingers=finger_names(config)),
         config=config,
-        joints=position_order(hand.model, hand.palm_link),
+        joints=hand.joint_order,
         versions={**versions, "hand": source.digest},
     )
 

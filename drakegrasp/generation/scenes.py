@@ -49,7 +49,6 @@ from drakegrasp.frames import make_pose, pack_pose, rotation_about
 from drakegrasp.generation.attempts import find_attempt
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.hand.parsing import position_order
 from drakegrasp.hand.settings import override_config
 from drakegrasp.mesh.surfaces import even_points, on_faces, unit_normals
 from drakegrasp.outcomes import Outcome
@@ -109,7 +108,7 @@ def _make_scenes(
     manifest = read_manifest(out)
     config = _with_scenes(manifest.config, overrides)
     hand = load_hand(config.hand_source)
-    joints = manifest.joints or position_order(hand.model, hand.palm_link)
+    joints = manifest.joints or hand.joint_order
     manifest = replace(manifest, config=config, joints=joints)
     trials = Trials(out)
     tasks, count = _tasks(out, manifest, trials), len(manifest.objects)

@@ -50,6 +50,7 @@ from drakegrasp.hand.parsing import (
     joint_slides,
     make_chains,
     moving_joint,
+    position_order,
     validate_own_joints,
 )
 from drakegrasp.hand.shapes import pad_surfaces
@@ -95,6 +96,11 @@ class Hand:
     def num_fingers(self) -> int:
         """Number of fingers, k."""
         return len(self.fingers)
+
+    @property
+    def joint_order(self) -> tuple[str, ...]:
+        """Names of the model's j joints in the plant's order, as in every `q`."""
+        return position_order(self.model, self.palm_link)
 
     def palm_in(self, link: str) -> Array:
         """Return the pose X_AG (4, 4) of the palm frame in a frame A of the hand.

@@ -34,7 +34,6 @@ from drakegrasp.scoring.ranking import Ranking, chosen_hand, rank
 from drakegrasp.simulation.attempts import GraspTable, join_attempts, make_attempts
 from drakegrasp.simulation.closing import closing_positions
 from drakegrasp.simulation.palms import Palms
-from drakegrasp.simulation.posture import joint_order
 from drakegrasp.vision.depth_image import View, cloud_from_depth
 
 
@@ -71,7 +70,7 @@ def propose(
 
     # Close the hand on the points, with one spread at a time.
     solid = hull_solid(points)
-    names, count = joint_order(shaped), len(palms)
+    names, count = shaped.joint_order, len(palms)
     poses, spreads = np.array([palm.X_TG for palm in palms]), [palm.spread for palm in palms]
     q_opened, q_grasp = np.zeros((2, count, len(names)))
     for spread in dict.fromkeys(spreads):

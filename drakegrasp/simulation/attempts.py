@@ -37,7 +37,6 @@ from drakegrasp.simulation.posture import (
     BESIDE_GRASP,
     Posture,
     exact_pose,
-    joint_order,
     preshape_index,
     start_of,
 )
@@ -328,7 +327,7 @@ def make_attempts(
 
     # The joints in the plant's order, and the pose of the palm frame.
     stages = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
-    q = _in_order(hand, list(joint_order(hand) if joints is None else joints), stages, kept)
+    q = _in_order(hand, list(hand.joint_order if joints is None else joints), stages, kept)
     if link is not None:
         X_FG = multiply(np.asarray(X_FG), hand.palm_in(link))
     for stage in ("q_pregrasp", "q_squeeze"):
@@ -482,7 +481,7 @@ def _in_order(
 
     For each row, `kept` has the positions of the joints that its preshape keeps.
     """
-    order = joint_order(hand)
+    order = hand.joint_order
     if unknown := [name for name in joints if name not in order]:
         raise GraspError(
             f"joints must be those of the hand, got {unknown[0]!r}: rename them in the file, or "
@@ -574,7 +573,7 @@ def _preshapes(
     if len(names) != len(palms):
         raise GraspError(f"preshape must be of {len(palms)} rows, got {len(names)}")
     # A row without joints, or whose preshape does not exist, keeps none that has to be known.
-    kept: list[Mapping[str, float]] = [dict.fromkeys(joint_order(hand), np.nan)] * len(names)
+    kept: list[Mapping[str, float]] = [dict.fromkeys(hand.joint_order, np.nan)] * len(names)
     for i, name in enumerate(names):
         if not (name == EACH and palms[i] and hand.preshapes):
             try:

@@ -17,7 +17,6 @@ from drakegrasp.errors import GraspError
 from drakegrasp.frames import Array, read_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, open_together
-from drakegrasp.hand.parsing import position_order
 from drakegrasp.simulation.attempt import Attempt
 
 #: A joint follows the hand file if it is at most this far from where the file has it (coupled
@@ -40,8 +39,8 @@ OPEN = 1e-6
 class Posture:
     """A wrist pose and joint positions of a hand with j joints, in the plant's order.
 
-    The order is that of the stored `closed_q`; `joint_order` names the joints. Without joints, the
-    hand closes from its open posture.
+    The order is that of the stored `closed_q`; `Hand.joint_order` names the joints. Without joints,
+    the hand closes from its open posture.
 
     Attributes:
         X_OG: Pose of the palm (4, 4).
@@ -86,11 +85,6 @@ def exact_pose(X: npt.ArrayLike, name: str) -> Array:
     return given if given.shape == (4, 4) and np.abs(pose - given).max() < EXACT else pose
 
 
-def joint_order(hand: Hand) -> tuple[str, ...]:
-    """Return the names of a hand's joints in the plant's order, that of the stored `closed_q`."""
-    return position_order(hand.model, hand.palm_link)
-
-
 def start_of(posture: Posture, hand: Hand) -> Attempt:
     """Return what the trial of a posture starts from.
 
@@ -115,7 +109,7 @@ def _start_of(posture: Posture, hand: Hand) -> Attempt:
     given = [q for q in (posture.q_pregrasp, posture.q_grasp, posture.q_squeeze) if q is not None]
     start = opened(posture.q_grasp, hand) if posture.q_pregrasp is None else posture.q_pregrasp
     own_motors = not all(follows_couplings(q, hand) for q in given)
-    index = {name: i for i, name in enumerate(joint_order(hand))}
+    index = {name: i for i, name in enumerate(hand.joint_order)}
     # If spread joints differ, use the first one.
     spread = float(posture.q_grasp[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
     spread = float(np.clip(spread, *coordinate_limits(hand)[0]))
@@ -154,7 +148,7 @@ def _start_of(posture: Posture, hand: Hand) -> Attempt:
 
 def follows_couplings(q: Array, hand: Hand) -> bool:
     """Return whether the hand file's motors can reach joint positions (j,)."""
-    index = {name: i for i, name in enumerate(joint_order(hand))}
+    index = {name: i for i, name in enumerate(hand.joint_order)}
     spreads = [q[index[name]] for name in hand.spread.joints]
     if spreads and np.ptp(spreads) > COUPLED:
         return False
@@ -172,7 +166,7 @@ def opened(q_grasp: Array, hand: Hand) -> Array:
     Each closing joint opens by this and coupled joints by their ratios, but not beyond their
     limits.
     """
-    order, q = joint_order(hand), q_grasp.copy()
+    order, q = hand.joint_order, q_grasp.copy()
     least = coordinate_limits(hand)[1:, 0]
     limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
     for i, finger in enumerate(hand.fingers):
@@ -188,7 +182,7 @@ def opened(q_grasp: Array, hand: Hand) -> Array:
 
 def squeezed(start: Array, grasp: Array, hand: Hand) -> Array:
     """Return the joint positions (j,) that lie beyond a grasp by `SQUEEZED`."""
-    order = joint_order(hand)
+    order = hand.joint_order
     slides = np.array([hand.joint_units[name] == "m" for name in order])
     units = np.where(slides, 0.1, 1.0)
     most = float((np.abs(grasp - start) / units).max())

@@ -28,7 +28,6 @@ from drakegrasp.filters import Removal
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.generation.attempts import unjudged
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.parsing import position_order
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.files import atomic_hdf5
@@ -490,7 +489,7 @@ def write_results(
     shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
     with atomic_hdf5(path) as file:
         versions, fingers = installed_versions(config), finger_names(config)
-        joints = position_order(hand.model, hand.palm_link)
+        joints = hand.joint_order
         origin = origin_attributes(config, versions, fingers, joints)
         file.attrs.update(origin)
         group = file.create_group(GROUP)

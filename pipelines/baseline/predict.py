@@ -38,7 +38,6 @@ from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.attempts import join_attempts, make_attempts
-from drakegrasp.simulation.posture import joint_order
 
 #: Two proposals are the same if their palms differ by less than both limits [m, rad].
 SAME = (0.01, np.deg2rad(15))
@@ -195,7 +194,7 @@ def chosen_by_closing(found: Choice, cloud: Array, hand: dg.Hand, joints: Sequen
         frame="table",
     )
     both = join_attempts([own, above])
-    order = [joint_order(hand).index(name) for name in joints]
+    order = [hand.joint_order.index(name) for name in joints]
     q = both.q_grasp[:, order], both.q_pregrasp[:, order]
     return Choice(both.X_FG, *q, dg.rank(both, cloud, hand).score)
 

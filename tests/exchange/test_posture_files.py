@@ -21,10 +21,9 @@ from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.simulation.attempts import CONDITIONS, GraspTable, quaternion_poses, ranked
-from drakegrasp.simulation.posture import joint_order
 
 HAND = load_hand("allegro")
-ORDER = joint_order(HAND)
+ORDER = HAND.joint_order
 POSES = np.array([make_pose(rotation_about([0.0, 0.6, 0.8], a), [a, 0.1, 0.2]) for a in (0.3, 2.0)])
 GRASP = np.arange(32.0).reshape(2, 16) / 100.0
 PREGRASP, SQUEEZE = GRASP - 0.05, GRASP + 0.05
@@ -81,12 +80,12 @@ def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path):
     table = read_own(tmp_path, hand, **rows, q_grasp=[[0.1, 0.2, 0.3]] * 2, joints=joints)
     assert table.preshape == ("tripod", "tripod")
     expected = joint_positions(tripod, 0.0, [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(table.q_grasp[1], [expected[name] for name in joint_order(hand)])
+    np.testing.assert_allclose(table.q_grasp[1], [expected[name] for name in hand.joint_order])
 
 
 def test_a_row_of_a_preshape_that_the_hand_lacks_spoils_no_other(tmp_path):
     hand = load_hand("allegro_four")
-    known, q = hand.preshape_names[0], np.zeros((3, len(joint_order(hand))))
+    known, q = hand.preshape_names[0], np.zeros((3, len(hand.joint_order)))
     rows = {"object": ["mug"] * 3, "X_FG": [np.eye(4)] * 3, "preshape": [known, "fist", ""]}
     table = read_own(tmp_path, hand, **rows, q_grasp=q)
     assert table.preshape == (known, "fist", "")
@@ -109,7 +108,7 @@ def test_all_that_is_known_is_written(tmp_path):
     """What a reader knows of a row comes in again, and the file states its hand."""
     hand = load_hand()
     closed = joint_positions(hand, 0.0, [0.5] * hand.num_fingers)
-    q = np.tile([closed[name] for name in joint_order(hand)], (3, 1))
+    q = np.tile([closed[name] for name in hand.joint_order], (3, 1))
     known = {
         **{f"q_{stage}": q + 0.01 * i for i, stage in enumerate(("grasp", "pregrasp", "squeeze"))},
         "X_TO": np.tile(make_pose(np.eye(3), [0.0, 0.0, 0.1]), (3, 1, 1)),
@@ -301,7 +300,7 @@ def test_grasps_of_another_gripper_are_refused_unless_their_frame_is_named(tmp_p
 def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
     leap = load_hand("leap")
     assert leap.palm_link == "palm" and not np.allclose(leap.X_BG, np.eye(4))
-    grasp = isaac_grasp(POSES[0], cspace_position=dict.fromkeys(joint_order(leap), 0.1))
+    grasp = isaac_grasp(POSES[0], cspace_position=dict.fromkeys(leap.joint_order, 0.1))
     table = read_attempts(write_isaac(tmp_path / "mug.yaml", grasp_0=grasp), leap)
     np.testing.assert_allclose(table.X_FG[0], POSES[0] @ leap.X_BG, atol=1e-9)
 
@@ -333,7 +332,7 @@ def test_a_palm_pose_needs_no_joints(tmp_path, form):
 
 def test_a_palm_pose_in_each_preshape_has_no_joints(tmp_path):
     hand = load_hand("allegro_four")
-    q = np.zeros((1, len(joint_order(hand))))
+    q = np.zeros((1, len(hand.joint_order)))
     content = {"object": ["mug"], "X_FG": POSES[:1], "preshape": ["each"]}
     table = read_own(tmp_path, hand, **content)
     assert table.invalid == ("",) and table.shapes(0, hand) == hand.preshape_names
@@ -547,7 +546,7 @@ def test_samples_that_were_exported_come_back(exported, grasps):
         table = read_attempts(exported(form), hand)
         assert table.frame == "object"
         assert sorted(table.objects) == sorted(grasp.object_name for grasp in grasps)
-        assert np.abs(table.q_pregrasp[:, joint_order(hand).index(spread)]).min() > 0.0
+        assert np.abs(table.q_pregrasp[:, hand.joint_order.index(spread)]).min() > 0.0
         for i, name in enumerate(table.objects):
             assert any(
                 np.allclose(grasp.X_TO @ table.X_FG[i], grasp.X_TG, atol=1e-9)

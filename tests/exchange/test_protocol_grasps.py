@@ -30,7 +30,7 @@ from drakegrasp.runtime import environment
 from drakegrasp.simulation.attempts import quaternion_poses
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import Posture, joint_order
+from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.placing import place_on_object
 from drakegrasp.verification.verify import first_fit
@@ -64,7 +64,7 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
     far = record.X_OG.copy()
     far[2, 3] += 0.3
     named = joint_positions(HAND, 0.0, np.zeros(3))
-    opened = [named[name] for name in joint_order(HAND)]
+    opened = [named[name] for name in HAND.joint_order]
     np.savez(
         tmp_path / "own.npz",
         object=np.array(["a", "a", "a"]),

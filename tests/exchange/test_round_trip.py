@@ -38,7 +38,6 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.scoring.run import VERDICTS
-from drakegrasp.simulation.posture import joint_order
 
 NAME, HAND = "1_brick_a", "allegro_four"
 #: What decides verdicts and is in no file that was exported.
@@ -111,7 +110,7 @@ def written(
 def write_own(path: Path, samples: Trials) -> Path:
     """Write the samples as a user's file, which says resting pose, row and preshape."""
     hand = load_hand(HAND)
-    order, names = joint_order(hand), [hand.preshape_names[k] for k in samples["preshape"]]
+    order, names = hand.joint_order, [hand.preshape_names[k] for k in samples["preshape"]]
     starts = [joint_positions(hand.at(k), 0.0, np.zeros(len(hand.at(k).fingers)))
               for k in samples["preshape"]]  # fmt: skip
     X_OG, q = unpack_pose(samples["X_OG"]), samples["closed_q"]

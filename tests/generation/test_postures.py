@@ -37,7 +37,6 @@ from drakegrasp.simulation.attempt import Source
 from drakegrasp.simulation.attempts import GraspTable, make_attempts, unknown_objects
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import place_object
-from drakegrasp.simulation.posture import joint_order
 from drakegrasp.simulation.trial import run_attempt
 from drakegrasp.verification.placing import place_on_dataset, place_on_object
 
@@ -65,12 +64,12 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> GraspTable:
     scene = build_scene(model, CONFIG.physics, HAND)
     held = run_attempt(scene, standing(model), attempt, CONFIG)
     start = joint_positions(HAND, 0.0, np.zeros(3))
-    opened = np.array([start[name] for name in joint_order(HAND)])
+    opened = np.array([start[name] for name in HAND.joint_order])
 
     coupled, bent = held.closed.q, held.closed.q.copy()
     for finger in HAND.fingers:
-        bent[joint_order(HAND).index(finger.coupled[0].joint)] += 0.1
-        bent[joint_order(HAND).index(finger.closing_joint)] -= 0.04
+        bent[HAND.joint_order.index(finger.coupled[0].joint)] += 0.1
+        bent[HAND.joint_order.index(finger.closing_joint)] -= 0.04
     inside = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.05])
     below = make_pose(np.eye(3), [0.0, 0.0, -0.2])
     nothing = np.full(8, np.nan)
@@ -202,7 +201,7 @@ def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
         [NAME] * 3,
         [attempt.X_OG] * 3,
         [held.closed.q] * 3,
-        q_pregrasp=[[start[name] for name in joint_order(hand)] for start in starts],
+        q_pregrasp=[[start[name] for name in hand.joint_order] for start in starts],
         preshape=["pair", "", "pair"],
     )
     return built(meshes, folder / "out", table, config), held.closed.q
@@ -228,7 +227,7 @@ def test_scenes_have_the_hand_from_which_a_posture_of_a_preshape_closed(of_presh
         by_trial = np.argsort(file["grasps/trial_id"][:])
         q_open = file["grasps/q_open"][:][by_trial]
     pair = load_hand(read_manifest(out).config.hand_source).at(1)
-    order = joint_order(pair)
+    order = pair.joint_order
     for row, at in ((0, 0.0), (2, BEGUN)):
         start = joint_positions(pair, 0.0, np.full(2, at))
         np.testing.assert_allclose(q_open[row], [start[name] for name in order], atol=1e-6)

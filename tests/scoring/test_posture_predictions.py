@@ -17,7 +17,6 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.scoring.verdict import rank_file
-from drakegrasp.simulation.posture import joint_order
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 HAND = load_hand()
@@ -32,7 +31,7 @@ def own_postures(data, rows):
         "row": rows,
         "X_FG": unpack_pose(trials["X_OG"][chosen]),
         "q_grasp": trials["closed_q"][chosen],
-        "q_pregrasp": np.array([[q[name] for name in joint_order(HAND)] for q in opened]),
+        "q_pregrasp": np.array([[q[name] for name in HAND.joint_order] for q in opened]),
     }
 
 

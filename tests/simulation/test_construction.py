@@ -15,7 +15,6 @@ from pydrake.multibody.tree import BodyIndex, RigidBody
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.parsing import position_order
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import (
@@ -218,7 +217,7 @@ def test_positions_are_in_the_order_of_a_tree_that_the_palm_is_the_root_of(
     path.write_text(f"{path.read_text()}preshape: {{wrist: 0.0}}\n")
     hand = load_hand(path)
     names = hand_joint_names(build_scene(cube, config.physics, hand))
-    assert names == list(position_order(hand.model, hand.palm_link))
+    assert names == list(hand.joint_order)
     assert names[-1] == "wrist"
     # It has a unit, too, though no chain of the palm's has it.
     assert hand.joint_units == dict.fromkeys(hand.joint_names, "rad")

@@ -23,7 +23,6 @@ from drakegrasp.simulation.placement import PlacedObject, run_trial
 from drakegrasp.simulation.posture import (
     OPENED,
     Posture,
-    joint_order,
     opened,
     start_of,
 )
@@ -41,7 +40,7 @@ X = make_pose(rotation_about([0.0, 0.6, 0.8], 0.7), [0.1, -0.2, 0.3])
 
 def posture_of(hand, spread: float, closing: list[float], **other: np.ndarray) -> Posture:
     named = joint_positions(hand, spread, closing)
-    return Posture(X, np.array([named[name] for name in joint_order(hand)]), **other)
+    return Posture(X, np.array([named[name] for name in hand.joint_order]), **other)
 
 
 @pytest.mark.parametrize("frame", ["object", "table", "camera", "world"])
@@ -57,7 +56,7 @@ def test_pose_in_any_frame_is_held_in_the_object(frame):
 
 def test_joints_in_another_order_are_told_by_their_names():
     hand = load_hand("allegro")
-    order, q = joint_order(hand), np.arange(16.0) / 100.0
+    order, q = hand.joint_order, np.arange(16.0) / 100.0
     made = make_posture(hand, X, q[::-1], q[::-1], joints=order[::-1])
     np.testing.assert_array_equal(made.q_grasp, q)
     np.testing.assert_array_equal(made.q_pregrasp, q)
@@ -100,7 +99,7 @@ def test_joint_off_its_coupling_by_more_than_a_degree_has_a_motor(joint, off_deg
     hand = load_hand()
     good = posture_of(hand, 0.2, [1.0, 1.0, 1.0]).q_grasp
     q = {name: good.copy() for name in ("q_grasp", "q_pregrasp", "q_squeeze")}
-    q[stage][joint_order(hand).index(joint)] += np.deg2rad(off_deg)
+    q[stage][hand.joint_order.index(joint)] += np.deg2rad(off_deg)
     start = start_of(Posture(X, **q), hand)
     assert start.own_motors == own
 
@@ -112,7 +111,7 @@ def test_joint_off_its_coupling_by_more_than_a_degree_has_a_motor(joint, off_deg
 def test_joint_that_no_motor_moves_is_locked_where_the_grasp_has_it(joint, own, pregrasp):
     """Of the preshape where the hand file's motors close, or without a motor of its own."""
     hand = load_hand("allegro")
-    at = joint_order(hand).index(joint)
+    at = hand.joint_order.index(joint)
     grasp = np.full(16, 0.6) if own else posture_of(hand, 0.0, [0.5, 0.5, 0.5]).q_grasp
     grasp[at] += 0.1
     start = start_of(Posture(X, grasp, pregrasp), hand)
@@ -124,7 +123,7 @@ def test_joints_beyond_their_limits_are_brought_within():
     hand = load_hand("allegro")
     _, grasp, _ = start_of(Posture(X, np.full(16, 3.0)), hand).path
     upper = dict(zip(hand.joint_names, hand.joint_limits[:, 1], strict=True))
-    np.testing.assert_array_equal(grasp, [upper[name] for name in joint_order(hand)])
+    np.testing.assert_array_equal(grasp, [upper[name] for name in hand.joint_order])
     assert (opened(grasp, hand) <= grasp).all()
 
 
@@ -140,14 +139,14 @@ def held(scene, cube, config) -> TrialRecord:
 def given(scene, held) -> Posture:
     hand = scene.hand
     named = joint_positions(hand, 0.0, np.zeros(3))
-    start = np.array([named[name] for name in joint_order(hand)])
+    start = np.array([named[name] for name in hand.joint_order])
     return Posture(held.X_OG, held.closed.q, start)
 
 
 @pytest.fixture(scope="module")
 def uncoupled(given, scene) -> Posture:
     """The held posture with its fingertips bent by 6 degrees more, and its first links by less."""
-    q, order = given.q_grasp.copy(), joint_order(scene.hand)
+    q, order = given.q_grasp.copy(), scene.hand.joint_order
     for finger in scene.hand.fingers:
         q[order.index(finger.coupled[0].joint)] += 0.1
         q[order.index(finger.closing_joint)] -= 0.04
@@ -209,7 +208,7 @@ def test_public_trial_closes_the_fingers_of_the_preshape(cube, given, tmp_path):
     placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
     assert len(run_trial(placed, replace(given, preshape="all")).closed.contacts.touching) == 3
     # The second finger stays open.
-    q, order = given.q_grasp.copy(), joint_order(load_hand(path))
+    q, order = given.q_grasp.copy(), load_hand(path).joint_order
     q[[order.index(name) for name in ("finger2_proximal_joint", "finger2_distal_joint")]] = 0.0
     trial = run_trial(placed, replace(given, q_grasp=q, preshape="pair"))
     assert trial.closed.contacts.touching.tolist() == [True, True]
