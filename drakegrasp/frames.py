@@ -30,6 +30,8 @@ from drakegrasp.errors import GraspError, first_line
 
 #: Position of the table-top centre T in the world [m] (Veres et al., "Coordinate frames").
 P_WT = np.array([0.0, 0.0, 0.65])
+#: Acceleration of gravity along -Wz [m/s^2], that of Drake.
+GRAVITY = 9.81
 
 #: Largest deviation of a rotation matrix from orthogonal; files store them in single precision.
 ROTATION_TOLERANCE = 1e-4

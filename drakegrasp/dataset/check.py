@@ -46,7 +46,14 @@ from drakegrasp.dataset.paths import (
     recorded_model,
     validate_model_file,
 )
-from drakegrasp.dataset.schema import CAMERAS, POSITIVE, SPLITS, Field, validate_schema_version
+from drakegrasp.dataset.schema import (
+    CAMERAS,
+    POSITIVE,
+    ROW_NUMBERS,
+    SPLITS,
+    Field,
+    validate_schema_version,
+)
 from drakegrasp.dataset.shards import ShardHeader, open_shard
 from drakegrasp.dataset.trials import Stamp, Trials, reopened, stamp
 from drakegrasp.errors import DataError, DrakegraspError, MeshError, first_line, printable
@@ -91,16 +98,7 @@ LAST_PLACES = 2
 #: A contact on the object's outline may be rounded to a pixel beside the mask, and the collision
 #: mesh and `filters.max_surface_distance` allow it to be off the full mesh.
 MASK_TOLERANCE = 2.0  # [px]
-#: Columns that number the rows of another group, by their group; and columns of codes.
-NUMBERS: Mapping[str, Mapping[str, str]] = {
-    "trials": {"object": "objects"},
-    **{split: {"trial_id": "trials"} for split in SPLITS},
-    "successes": {"trial_id": "trials"},
-    "scenes": {"object": "objects"},
-    "views": {"scene": "scenes"},
-    "grasps": {"scene": "scenes"},
-    "visible": {"view": "views", "grasp": "grasps"},
-}
+#: Columns of codes, by their group and name.
 CODES: Mapping[tuple[str, str], list[int]] = {
     ("trials", "outcome"): [each.value for each in Outcome if not each.verification_only],
     ("successes", "removal"): [each.value for each in Removal],
@@ -452,7 +450,7 @@ def _numbers(t: Table, task: _Rows) -> Iterator[Finding]:
     if task.group == "trials":
         values = t["trial_id"]
         yield "trial_id must be the number of the row", values != t[NUMBER], values
-    for name, of in NUMBERS.get(task.group, {}).items():
+    for name, of in ROW_NUMBERS.get(task.group, {}).items():
         values = t[name]
         bad = _any((values < 0) | (values >= task.counts.get(of, np.inf)))
         yield f"{name} must be one of the rows of /{of}", bad, values

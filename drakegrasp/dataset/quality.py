@@ -30,12 +30,10 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.dataset.schema import TRIAL_FIELDS, Shown
-from drakegrasp.frames import unpack_pose
+from drakegrasp.frames import GRAVITY, unpack_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.outcomes import Outcome, Stage
 
-#: Drake's gravity [m/s^2], as in `simulation.settle`, which loads Drake.
-GRAVITY = 9.81
 #: Largest value of a part: one extreme number must not hide the others.
 CAP = 3.0
 

@@ -747,3 +747,13 @@ SCENE_TABLES: Tables = {
     "grasps": SCENE_GRASP_FIELDS,
     "visible": VISIBLE_FIELDS,
 }
+#: Columns that number the rows of another group, by their group.
+ROW_NUMBERS: Mapping[str, Mapping[str, str]] = {
+    "trials": {"object": "objects"},
+    **{split: {"trial_id": "trials"} for split in SPLITS},
+    "successes": {"trial_id": "trials"},
+    "scenes": {"object": "objects"},
+    "views": {"scene": "scenes"},
+    "grasps": {"scene": "scenes"},
+    "visible": {"view": "views", "grasp": "grasps"},
+}

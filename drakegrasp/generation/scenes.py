@@ -34,6 +34,7 @@ from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, count_scenes, grasps_o
 from drakegrasp.dataset.schema import (
     DEPTH_UNIT,
     NO_PRESHAPE,
+    ROW_NUMBERS,
     SCENE_GRASP_FIELDS,
     SCENE_TABLES,
     SPLITS,
@@ -61,15 +62,6 @@ from drakegrasp.simulation.attempt import Conditions, Source, conditions_from, u
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
 from drakegrasp.vision.rendering import Renderer, paint, render
-
-#: Columns with row numbers of other groups; a task counts these rows from its object's first row.
-_ROWS_OF = {
-    ("scenes", "object"): "objects",
-    ("views", "scene"): "scenes",
-    ("grasps", "scene"): "scenes",
-    ("visible", "view"): "views",
-    ("visible", "grasp"): "grasps",
-}
 
 
 def make_scenes(
@@ -230,8 +222,14 @@ def _write_images(
 
 
 def _numbered(group: str, columns: Columns, rows: Mapping[str, int]) -> Columns:
-    """Return columns whose row numbers count from the first row of the file."""
-    added = {name: rows[of] for (own, name), of in _ROWS_OF.items() if own == group}
+    """Return columns whose row numbers count from the first row of the file.
+
+    Args:
+        group: Name of the group.
+        columns: The columns of an object, whose row numbers count from the object's first row.
+        rows: The object's first row in each group.
+    """
+    added = {name: rows[of] for name, of in ROW_NUMBERS.get(group, {}).items()}
     return {name: v + added[name] if name in added else v for name, v in columns.items()}
 
 

@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
-from drakegrasp.frames import Array, transform_points
+from drakegrasp.frames import GRAVITY, Array, transform_points
 from drakegrasp.hand.description import FINGER_DAMPING, Hand, load_hand
 from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.finger_sweep import (
@@ -218,7 +218,7 @@ def check_efforts(hand: Hand, config: Config) -> Finding:
 
     # Compute the fingertip forces, and whether friction then supports the payload.
     forces = fingertip_forces(hand, "torque")
-    carried = config.physics.friction_hand * float(forces.sum()) / 9.81
+    carried = config.physics.friction_hand * float(forces.sum()) / GRAVITY
     if hand.payload is not None and carried < hand.payload:
         # Round down to grams, because the reported payload must pass the check.
         most = np.floor(1e3 * carried) / 1e3

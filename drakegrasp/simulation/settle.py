@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError, first_line
-from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
+from drakegrasp.frames import GRAVITY, X_WT, Array, invert_pose, make_pose, transform_points
 from drakegrasp.mesh.remeshing import subdivide
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.objects.model import ObjectModel
@@ -28,8 +28,8 @@ CHECK_PERIOD = 0.05
 #: Longest edge of the surface that lands [m], and the number of faces up to which longer edges are
 #: split. A base supports to within about a quarter of the longest edge from its rim.
 MAX_EDGE, MAX_FACES = 0.02, 12_000
-#: Drake's gravity [m/s^2], and the largest relative error of the table's force at rest.
-GRAVITY, MAX_FORCE_ERROR = 9.81, 0.01
+#: Largest relative error of the table's force at rest.
+MAX_FORCE_ERROR = 0.01
 #: A resting pose is rounded to multiples of this, in p_TO [m] and in the quaternion of R_TO: about
 #: a micrometre and a microradian. Drake's last bits depend on the CPU, and the palm poses depend on
 #: the resting pose.

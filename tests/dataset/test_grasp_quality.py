@@ -11,7 +11,6 @@ import numpy.typing as npt
 import pytest
 from helpers.datasets import TRIALS, make_dataset, must_find
 
-from drakegrasp.dataset import quality as module
 from drakegrasp.dataset.quality import (
     CAP,
     COLUMNS,
@@ -20,9 +19,8 @@ from drakegrasp.dataset.quality import (
 )
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import ROBUST_FIELDS
-from drakegrasp.frames import make_pose, pack_pose, rotation_about
+from drakegrasp.frames import GRAVITY, make_pose, pack_pose, rotation_about
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation import settle
 
 #: Three unit normals that add up to nothing.
 BALANCED = np.array([[1.0, 0.0, 0.0], [-0.5, np.sqrt(0.75), 0.0], [-0.5, -np.sqrt(0.75), 0.0]])
@@ -32,7 +30,7 @@ SCALES = {part.name: part.scale for part in PARTS}
 def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
     """Columns of grasps of which no part is anomalous; the lifted object is turned."""
     R_TO = rotation_about([0.0, 0.0, 1.0], 0.3) @ rotation_about([1.0, 0.0, 0.0], 2.0)
-    pull_T = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [0.0, 0.0, mass * module.GRAVITY]])
+    pull_T = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [0.0, 0.0, mass * GRAVITY]])
     rows: dict[str, Any] = {
         "outcome": np.uint8(Outcome.SUCCESS),
         "unused": np.uint32(0),
@@ -55,8 +53,7 @@ def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
 
 
 def test_scales_are_those_of_the_docs() -> None:
-    """See docs/reference/outcomes.md; gravity is the simulator's."""
-    assert module.GRAVITY == settle.GRAVITY
+    """See docs/reference/outcomes.md."""
     assert {name: round(scale, 9) for name, scale in SCALES.items()} == {
         "penetration": 4e-3,
         "normal_angle": round(np.pi / 6.0, 9),

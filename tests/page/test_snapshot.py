@@ -12,12 +12,11 @@ import pytest
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 from helpers.pages import numbered
 
-from drakegrasp.dataset.quality import GRAVITY
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
-from drakegrasp.frames import invert_pose, transform_points, unpack_pose
+from drakegrasp.frames import GRAVITY, invert_pose, transform_points, unpack_pose
 from drakegrasp.page.attempts import AttemptGallery
 from drakegrasp.page.renders import THUMBNAIL, contact_dots, read_render, read_rows
 from drakegrasp.page.snapshot import FEATURES, Snapshot, read_snapshot

@@ -24,7 +24,7 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
-from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.frames import GRAVITY, Array, invert_pose, transform_points
 from drakegrasp.hand.description import FINGER_DAMPING
 from drakegrasp.hand.draft.fingers import Answers
 from drakegrasp.hand.draft.grips import Finger, Grip, PalmFrame
@@ -114,7 +114,7 @@ def draft_file(
         tree["preshape"] = kept
 
     # Drive, speeds, and the hand's use.
-    carried = PAYLOAD * config.physics.friction_hand * float(forces.sum()) / 9.81
+    carried = PAYLOAD * config.physics.friction_hand * float(forces.sum()) / GRAVITY
     tree |= {
         "drive": "worm",
         **_speeds(grip, own, config),
