@@ -8,6 +8,7 @@ NumPy guarantees the raw stream of PCG64 and the mixing of `SeedSequence`. The r
 from __future__ import annotations
 
 import hashlib
+from enum import IntEnum
 from statistics import NormalDist
 
 import numpy as np
@@ -18,6 +19,21 @@ from drakegrasp.arithmetic import Array
 #: Normal numbers are rounded to multiples of this. Their tails need the C library's logarithm,
 #: whose last bits differ between machines by far less than this.
 _NORMAL_GRID = 2.0**-32
+
+
+class Draw(IntEnum):
+    """What a stream is for: the last number of its place, which tells streams of one seed apart.
+
+    Places whose last numbers are equal have different lengths.
+    """
+
+    CONDITIONS = 0  # of an attempt: an object's candidate and stand-off
+    SPLIT_OF_CLASS = 1  # which objects of a class are tested, which samples validate
+    SPLIT_OF_GROUP = 2  # the rank of a group of objects, in a split by object
+    SAMPLER = 2  # palms at a resting pose; for a user-defined sampler its key follows
+    DROP = 3  # the orientation in which an object falls
+    SCENE = 4  # an object's place, appearance and cameras
+    REPEAT = 5  # whether an attempt is repeated
 
 
 class Stream:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.seeding import Stream, object_key
+from drakegrasp.seeding import Draw, Stream, object_key
 
 #: A split, and the splits in the order of the files.
 Home: TypeAlias = Literal["train", "valid", "test"]
@@ -79,7 +79,7 @@ def _split_by_class(
     for class_name in sorted(members):
         own = sorted(members[class_name])
         # A key of three numbers: it never equals the stream of a candidate of an object so named.
-        stream = Stream(seed, object_key(class_name), 0, 1)
+        stream = Stream(seed, object_key(class_name), 0, Draw.SPLIT_OF_CLASS)
         # The test objects: one, all or none.
         if not may_train(class_name, len(own), config):
             tested, others = own, []
@@ -106,7 +106,7 @@ def rank_in_split(group: str, seed: int) -> float:
     It is uniform over seeds, so about a fraction x of all groups has a number below x.
     """
     # Not the stream of a class, which may have the same name.
-    return float(Stream(seed, object_key(group), 0, 2).uniform(1)[0])
+    return float(Stream(seed, object_key(group), 0, Draw.SPLIT_OF_GROUP).uniform(1)[0])
 
 
 def home_by_rank(group: str, config: SplitConfig) -> Home:

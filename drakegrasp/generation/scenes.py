@@ -57,7 +57,7 @@ from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import atomic_path, disk_full_named, new_hdf5
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.seeding import Stream, object_key
+from drakegrasp.seeding import Draw, Stream, object_key
 from drakegrasp.simulation.attempt import Conditions, Source, conditions_from, usual_materials
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
@@ -245,9 +245,8 @@ def _write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
 
 # The scenes of one object
 
-#: Last number of the place of a scene's streams, which other streams do not have.
-_PLACE = 4
-#: Number before it: for the object's place, for the scene's appearance, and for the first camera.
+#: Number before the last one of the place of a scene's streams: for the object's place, for the
+#: scene's appearance, and for the first camera.
 _WHERE, _LOOK, _CAMERA = 0, 1, 2
 Columns = dict[str, AnyArray]
 
@@ -302,7 +301,7 @@ def make_scenes_of(task: SceneTask) -> tuple[dict[str, Columns], dict[str, list[
 
 
 def _stream(config: Config, name: str, resting: int, number: int) -> Stream:
-    return Stream(config.seed, object_key(name), resting, number, _PLACE)
+    return Stream(config.seed, object_key(name), resting, number, Draw.SCENE)
 
 
 def _place(prepared: PreparedObject, resting: int, config: Config) -> Array:

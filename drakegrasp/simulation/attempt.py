@@ -28,7 +28,7 @@ from drakegrasp.arithmetic import Array, multiply, norm, sin_cos
 from drakegrasp.config import Config, PhysicsConfig, RandomizeConfig
 from drakegrasp.frames import make_pose, pack_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.seeding import Stream, object_key
+from drakegrasp.seeding import Draw, Stream, object_key
 from drakegrasp.vision.camera import Appearance, DepthSensor, usual_appearance
 
 
@@ -164,8 +164,6 @@ WORDS = {
     "friction_table": slice(17, 18),
     "mass": slice(18, 19),
 }
-#: Last number of the place of an attempt's stream; other streams have other last numbers.
-_PLACE = 0
 
 
 def draw_conditions(
@@ -179,7 +177,7 @@ def draw_conditions(
         candidate: Index of the attempt's candidate.
         standoff_index: Index of the attempt's stand-off.
     """
-    stream = Stream(config.seed, object_key(model.name), candidate, standoff_index, _PLACE)
+    stream = Stream(config.seed, object_key(model.name), candidate, standoff_index, Draw.CONDITIONS)
     return conditions_from(stream, model, config)
 
 
@@ -277,13 +275,11 @@ FACTOR_NOISE = 0.1
 #: Random factors are rounded to multiples of this; exponentials of two C libraries differ by far
 #: less.
 FACTOR_GRID = 2.0**-32
-#: Last number of the place of the stream that decides which attempts are repeated.
-_REPEATED = 5
 
 
 def is_drawn(attempt: Attempt, probability: float) -> bool:
     """Return whether an attempt is repeated; its own seed decides."""
-    stream = Stream(attempt.seed, attempt.standoff_index, _REPEATED)
+    stream = Stream(attempt.seed, attempt.standoff_index, Draw.REPEAT)
     return bool(stream.uniform(1)[0] < probability)
 
 

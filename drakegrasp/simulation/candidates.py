@@ -39,7 +39,7 @@ from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.mesh.surfaces import first_hits, on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.registry import own_class, run_own
-from drakegrasp.seeding import Stream, object_key
+from drakegrasp.seeding import Draw, Stream, object_key
 from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.palms import Shape
 from drakegrasp.table import Table
@@ -50,8 +50,6 @@ OURS = ("rotations", "normals", "closing")
 BLOCK = 1000
 #: Palms farther than this from the object must face it [m]; no hand is so large.
 FAR = 1.0
-#: Last number of the place of the stream of a sampler at a resting pose.
-_SAMPLER = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -269,7 +267,7 @@ def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
     # The paper's method uses the object's first stream.
     if (resting, method) == (0, "rotations"):
         return Stream(seed, object_key(name))
-    place = (resting, _source(method), _SAMPLER)
+    place = (resting, _source(method), Draw.SAMPLER)
     if _source(method) is not Source.OWN:
         return Stream(seed, object_key(name), *place)
     # Two user-defined samplers do not share numbers, and a new digest of a file changes no numbers.

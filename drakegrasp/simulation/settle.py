@@ -18,7 +18,7 @@ from drakegrasp.frames import GRAVITY, X_WT, Array, invert_pose, make_pose, tran
 from drakegrasp.mesh.remeshing import subdivide
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.seeding import Stream, object_key
+from drakegrasp.seeding import Draw, Stream, object_key
 from drakegrasp.simulation.construction import build_object_scene
 from drakegrasp.simulation.contacts import table_force
 from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
@@ -44,8 +44,6 @@ STOP_FRACTION = 0.6
 SAME_UP = np.pi / 18.0
 #: Time step of drops from random orientations [s].
 RANDOM_STEP = 0.008
-#: Last number of the place of the stream of a drop's orientation.
-_PLACE = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,7 +97,7 @@ def find_resting_poses(model: ObjectModel, config: Config) -> list[Resting]:
     """
     found, counts = [settle(model, config)], [1]
     for drop in range(1, config.objects.resting_poses):
-        stream = Stream(config.seed, object_key(model.name), drop, _PLACE)
+        stream = Stream(config.seed, object_key(model.name), drop, Draw.DROP)
         # Four normal random numbers, normalised, are a uniform quaternion (Muller 1959).
         try:
             resting = settle(model, config, _rotation(stream.normal(4)))
