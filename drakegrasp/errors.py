@@ -100,12 +100,13 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
 
 
-def listed(names: Sequence[str], total: int | None = None) -> str:
+def listed(names: Sequence[str], total: int | None = None, *, separator: str = ", ") -> str:
     """Return names in one line: at most the first `NAMED`, and how many more there are.
 
     Args:
         names: All names, or at least the first `NAMED`.
         total: Total number of names; None for the number of given names.
+        separator: What is between two names, for names that contain commas.
     """
     more = (len(names) if total is None else total) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
+    return separator.join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")

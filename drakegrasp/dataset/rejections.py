@@ -17,14 +17,12 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, with_config
 
 from drakegrasp.dataset.json_files import Name, read_mapping, stated, validated
-from drakegrasp.errors import DataError, printable
+from drakegrasp.errors import DataError, listed, printable
 from drakegrasp.runtime.files import write_atomic
 
 REJECT_FILE = "reject.json"
 #: Version of the file's layout.
 VERSION = 1
-#: Maximum number of rejections without effect that a message names.
-NAMED = 5
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -158,11 +156,10 @@ def unused_rejections(
     keys = {key for key in given if isinstance(key, AttemptKey)}
     skipped = sorted(keys - set(used))
     if skipped:
-        named = "; ".join(map(str, skipped[:NAMED]))
-        more = f"; and {len(skipped) - NAMED:,} more" if len(skipped) > NAMED else ""
+        named = listed([str(key) for key in skipped], separator="; ")
         return [
             f"skipped {len(skipped):,} of {len(keys):,} rejections, which name no success of the "
-            f"dataset: {named}{more}"
+            f"dataset: {named}"
         ]
 
     # Rejections of an inspection that were not requested.

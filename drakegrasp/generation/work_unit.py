@@ -259,10 +259,10 @@ class _UnitRun:
         columns = {f.name: f.empty(len(records), {}) for f in ROBUST_FIELDS}
         for row, record in enumerate(records):
             drawn = is_drawn(self._attempts[row], self._config.robustness.share)
-            if drawn and self._is_sample(record):
+            if drawn and self._passes_filters(record):
                 repeats = self._repeat(row)
                 columns["robust_tried"][row] = len(repeats)
-                columns["robust_kept"][row] = sum(map(self._is_sample, repeats))
+                columns["robust_kept"][row] = sum(map(self._passes_filters, repeats))
         # A scene in which Drake failed is no longer cached, so build it again.
         self._setup.renew_scene()
         return columns
@@ -278,7 +278,7 @@ class _UnitRun:
             X_TO = prepared.resting_poses[attempt.resting]
             return repeat_disturbed(prepared.model, X_TO, attempt, config)
 
-    def _is_sample(self, trial: TrialRecord) -> bool:
+    def _passes_filters(self, trial: TrialRecord) -> bool:
         """Return whether a trial is a sample by the default filters."""
         rules = self._config.model_copy(update={"filters": REPEAT_FILTERS})
         return judge_sample(self._setup.prepared.model, trial, rules, views=False) is Removal.KEPT

@@ -349,7 +349,7 @@ def lift_shares(completed: Sequence[PlacedObject], starts: Sequence[Attempt]) ->
 
 def _share(completed: Sequence[PlacedObject], start: Attempt) -> float:
     """Return the share of a grasp's lifts that end as a sample."""
-    samples = [_is_sample(placed, start) for placed in completed]
+    samples = [_lifts_to_sample(placed, start) for placed in completed]
     if not any(samples):
         return 0.0
     placed = completed[0]
@@ -361,11 +361,11 @@ def _share(completed: Sequence[PlacedObject], start: Attempt) -> float:
         replace(start, X_OG=multiply(start.X_OG, make_pose(np.eye(3), p_GH))) for p_GH in SHIFTS
     ]
     further.append(replace(start, conditions=replace(usual, materials=slippery)))
-    samples += [_is_sample(placed, each) for each in further]
+    samples += [_lifts_to_sample(placed, each) for each in further]
     return float(np.mean(samples))
 
 
-def _is_sample(placed: PlacedObject, start: Attempt) -> bool:
+def _lifts_to_sample(placed: PlacedObject, start: Attempt) -> bool:
     """Return whether a lift of the object from a start in {T} ends as a sample."""
     config = placed.config
     attempt = replace(start, X_OG=multiply(invert_pose(placed.X_TO), start.X_OG))

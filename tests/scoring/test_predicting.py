@@ -70,7 +70,7 @@ def test_a_share_is_of_all_lifts_of_a_grasp(monkeypatch):
         starts.append(start)
         return start.conditions is None
 
-    monkeypatch.setattr(ranking, "_is_sample", is_sample)
+    monkeypatch.setattr(ranking, "_lifts_to_sample", is_sample)
     assert ranking.lift_shares(
         [placed, placed], [Attempt(X_OG=np.eye(4), spread=0.0)]
     ).tolist() == [0.8]
