@@ -33,9 +33,10 @@ from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.attempt import Attempt, Conditions, draw_conditions, usual_conditions
 from drakegrasp.simulation.attempts import posture_attempts
 from drakegrasp.simulation.candidates import palm_attempts
+from drakegrasp.simulation.closing import centred
 from drakegrasp.simulation.scene import Scene, hand_joint_names
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
-from drakegrasp.simulation.screen import Screening, centred, screen
+from drakegrasp.simulation.screen import Screening, screen
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.table import AnyArray, Table
 from drakegrasp.vision.camera import (

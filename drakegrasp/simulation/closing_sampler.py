@@ -25,9 +25,8 @@ from drakegrasp.mesh.surfaces import even_points, on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.attempt import palm_motion
-from drakegrasp.simulation.closing import closing_features
+from drakegrasp.simulation.closing import centre, closing_features
 from drakegrasp.simulation.palms import DEEPER, Palms, Shape
-from drakegrasp.simulation.screen import centre
 
 #: Number of surface points around which palms are made.
 POINTS = 2048

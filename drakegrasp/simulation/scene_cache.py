@@ -29,9 +29,9 @@ from drakegrasp.config import (
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.attempt import Attempt, disturbed, usual_conditions
+from drakegrasp.simulation.closing import centred
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene
-from drakegrasp.simulation.screen import centred
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.vision.rendering import Renderer, build_renderer
 

@@ -9,12 +9,6 @@ of the points. The margins of `ScreenConfig` cover these errors.
 
 An attempt counts as lost only if it is lost by more than the margin. Every step treats each point
 separately, so a screening depends on its attempt alone, and not on the other attempts in the call.
-
-`centred` applies to hands in which opposed fingers share a motor. It moves the palm along the
-closing direction so that both sides meet the object at the same time. If one finger meets the
-object first, the other finger of the motor stops with it. A real gripper then pushes the object, or
-gives way, until both fingers touch. Here the object is clamped while the hand closes, so the palm
-is moved before.
 """
 
 from __future__ import annotations
@@ -25,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import dot, multiply, norm
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import ScreenConfig
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
@@ -34,7 +28,7 @@ from drakegrasp.hand.kinematics import open_together
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.attempt import Attempt, Source
+from drakegrasp.simulation.attempt import Attempt
 
 Counts = npt.NDArray[np.int64]
 
@@ -336,127 +330,3 @@ def _clear_starts(paths: HandPaths, starts: Counts) -> Counts:
     # Start one test before the first gap that is too small.
     first = np.where(clear.all(axis=1), len(time), np.argmin(clear, axis=1))
     return np.minimum(starts, np.maximum(0, GAP_STRIDE * (first - 1))[:, None])
-
-
-#: Number of moves of the palm; sliding jaws are centred after the first move.
-MOVES = 3
-#: A finger meets the object if it is closer than this [m]; largest number of steps of the search.
-TOUCH, STEPS = 5e-5, 40
-#: Points farther than this from the object need no exact distance [m].
-FAR = 0.02
-
-
-def centred(model: ObjectModel, hand: Hand, attempts: Sequence[Attempt]) -> list[Attempt]:
-    """Return attempts whose fingers that share a motor meet the object together, if they can.
-
-    An attempt is unchanged if its palm ray misses, its fingers start closed, one side of the
-    fingers does not meet the object, or no motor of the hand drives opposed fingers. An attempt of
-    a posture is also unchanged, because it is tried as given.
-
-    Args:
-        model: The object.
-        hand: The hand.
-        attempts: Attempts at the object.
-    """
-    # The paths of the fingers depend on preshape and spread.
-    found = list(attempts)
-    groups: dict[tuple[int | None, float], list[int]] = {}
-    for row, attempt in enumerate(found):
-        is_given = attempt.source is Source.POSTURES
-        if attempt.ray_hits and attempt.closing is None and not is_given:
-            groups.setdefault((attempt.preshape, attempt.spread), []).append(row)
-
-    for (preshape, spread), rows in groups.items():
-        given = np.stack([found[row].X_OG for row in rows])
-        X_OG = centre(model, hand.at(preshape), spread, given)
-        if X_OG is not given:
-            for row, X in zip(rows, X_OG, strict=True):
-                found[row] = replace(found[row], X_OG=X)
-    return found
-
-
-def centre(model: ObjectModel, hand: Hand, spread: float, X_OG: Array) -> Array:
-    """Return palm poses (n, 4, 4) at which fingers that share a motor meet the object together.
-
-    These are the given ones if no motor drives several fingers.
-
-    Args:
-        model: The object.
-        hand: The hand in one of its preshapes.
-        spread: Spread [rad].
-        X_OG: (n, 4, 4), palm poses.
-    """
-    shared = [np.flatnonzero(row) for row in hand.closing_ratio.T > 0.0]
-    shared = [fingers for fingers in shared if len(fingers) > 1]
-    paths = hand_paths(hand, spread) if shared else None
-    if paths is None:
-        return X_OG
-    X_OG = X_OG.copy()
-    for fingers in shared:
-        own = [paths.fingers[i] for i in fingers]
-        ratio = hand.closing_ratio[fingers].max(axis=1)
-        for _ in range(MOVES):
-            X_OG[:, :3, 3] += _move(model, X_OG, own, ratio)
-    return X_OG
-
-
-def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: Array) -> Array:
-    """Return the motion (n, 3) of palms in {O} [m]; 0 if one side of the fingers meets nothing."""
-    # Positions of the motor at which each finger meets the object, and the motion of its pad there.
-    lookup = PointLookup(model.field, np.eye(4), X_OG)
-    ends = [_meeting(lookup, path) for path in paths]
-    closing = [path.angles[1] * end for path, end in zip(paths, ends, strict=True)]
-    at = np.stack(closing) / ratio[:, None]
-    motion = np.stack([_pad_motion(path, end) for path, end in zip(paths, ends, strict=True)])
-    motion *= ratio[:, None, None]
-
-    # The first side has the fingers that move with the first finger. On each side, the finger that
-    # touches first decides. A pad that does not move has no direction and belongs to no side.
-    u = motion[0] / np.maximum(norm(motion[0]), np.finfo(float).tiny)[:, None]
-    speed = dot(motion, u)
-    first, rate = [], []
-    for side in (speed > 0.0, speed < 0.0):
-        where = np.where(side, at, np.inf)
-        nearest = where.argmin(axis=0)[None]
-        first.append(np.take_along_axis(where, nearest, axis=0)[0])
-        rate.append(np.abs(np.take_along_axis(speed, nearest, axis=0)[0]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (first[0] - first[1]) / (1.0 / rate[0] + 1.0 / rate[1])
-    distance = np.where(np.isfinite(distance), distance, 0.0)
-    along = (X_OG[:, :3, :3] * u[:, None, :]).sum(axis=2)
-    return np.asarray(distance[:, None] * along)
-
-
-def _meeting(lookup: PointLookup, path: FingerPath) -> Array:
-    """Return at which step (n,) of its path a finger meets the object; inf if it never does.
-
-    For a finger that is within the object when the hand is open, the place is negative: how far the
-    finger would have to open. No point moves by more than the largest `travel` per step, so the
-    smallest distance limits the number of free steps (sphere tracing; Hart 1996).
-    """
-    rate, end = float(path.travel.max()), len(path.angles) - 1
-    place, active = np.zeros(len(lookup)), np.arange(len(lookup))
-    for _ in range(STEPS):
-        if not len(active):
-            break
-        least = lookup.distances(active, points_at(path, place[active]), FAR).min(axis=1)
-        place[active] += least / rate
-        going = (np.abs(least) > TOUCH) & (place[active] >= 0.0) & (place[active] <= end)
-        active = active[going]
-    return np.where(place > end, np.inf, place)
-
-
-def points_at(path: FingerPath, place: Array) -> npt.NDArray[np.float32]:
-    """Return the points (n, p, 3) in {G} at places on a path, interpolated between its steps."""
-    before = np.clip(np.floor(place).astype(np.int64), 0, len(path.points) - 2)
-    share = (place - before).astype(np.float32)[:, None, None]
-    points = path.points[before] * (np.float32(1.0) - share)
-    return np.asarray(points + path.points[before + 1] * share)
-
-
-def _pad_motion(path: FingerPath, place: Array) -> Array:
-    """Return the motion (n, 3) of the pad's centre per closing position, in {G}."""
-    near = np.clip(np.where(np.isfinite(place), place, 0.0), 0, len(path.points) - 2)
-    before = near.astype(np.int64)
-    middle = path.points[:, : path.pad].astype(float).mean(axis=1)
-    return np.asarray((middle[before + 1] - middle[before]) / path.angles[1])

@@ -18,6 +18,7 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.closing import centred
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import disengage, drive_of, engage, opening_torques
 from drakegrasp.simulation.scene import (
@@ -28,7 +29,6 @@ from drakegrasp.simulation.scene import (
     release,
     reset_attempt,
 )
-from drakegrasp.simulation.screen import centred
 
 pytestmark = pytest.mark.sim
 #: Each jaw presses with so much [N].
