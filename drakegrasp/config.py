@@ -424,7 +424,7 @@ def _filter_config() -> type[_Filters]:
     for name, limit in LIMITS.items():
         kind = _KINDS[limit.kind] | None if limit.off == "null" else _KINDS[limit.kind]
         settings[name] = (kind, limit.default)
-    # User-defined filters: `file.py:Name`, or the name of a rule of another package.
+    # User-defined filters: `file.py:Name`, or the name of a filter of another package.
     own = Annotated[tuple[str, ...], BeforeValidator(partial(_named, "filters"))]
     settings["own"] = (own, ())
     doc = "Which successes become samples, decided when the files are assembled; null: no limit."

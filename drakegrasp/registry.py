@@ -1,4 +1,4 @@
-"""Finds things by name: samplers, rules, protocols, formats, hands, kinds of clusters.
+"""Finds things by name: samplers, filters, protocols, formats, hands, kinds of clusters.
 
 Each is an entry point of an installed package in the group `drakegrasp.KIND`. The package's own
 entry points are in pyproject.toml like those of any other package, and are loaded on request. A new

@@ -157,7 +157,7 @@ class RefusedMesh:
     Attributes:
         name: Name of the object.
         mesh_sha256: Hash of the mesh file and of its entry in `objects.yaml`, hexadecimal.
-        reason: Why the mesh was rejected, in words.
+        reason: Why the mesh was refused, in words.
         again: Whether the machine may be the cause, so that the next build tries the mesh again.
     """
 
@@ -174,7 +174,7 @@ class Manifest:
     Attributes:
         config: Resolved configuration, with the seed.
         objects: The objects, in the order of the dataset's rows.
-        refused: The meshes that were rejected.
+        refused: The meshes that were refused.
         rejected: Attempts that an inspection rejects: successes that are not samples.
         versions: Versions of the packages that built the dataset, and a hash of the hand's files.
         fingers: Names of the fingers in grasp order, each with whether a grasp needs its fingertip.

@@ -101,8 +101,8 @@ class Field:
     """One field of a file.
 
     Attributes:
-        name: Path below the group, which is a split, `/trials`, `/objects`, `/successes`, `/looks`
-            or `/grasps`.
+        name: Path below the group, which is a split, `/trials`, `/objects`, `/successes`, `/looks`,
+            `/grasps`, `/scenes`, `/views`, `/visible` or `/rows`.
         dtype: NumPy's name of the type, or "str" for UTF-8 text.
         meaning: One sentence that describes the field.
         shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer or a

@@ -33,7 +33,7 @@ class Funnel:
 
     Attributes:
         names, classes: (m,), names and classes of the objects.
-        candidates: (m,), palm poses that were tried or are to be tried.
+        candidates: (m,), palm poses that were tried.
         outcomes: (m, 1 + max(Outcome)), attempts by object and outcome.
         precision, stable: (m,), successes that are precision grasps, and those that are also
             stable.

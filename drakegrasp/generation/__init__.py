@@ -1,1 +1,1 @@
-"""Building a dataset: objects prepared, work units simulated, what they cost."""
+"""Building a dataset: objects prepared, work units simulated, files assembled and merged."""

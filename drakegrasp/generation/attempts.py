@@ -35,9 +35,9 @@ from drakegrasp.simulation.attempts import posture_attempts
 from drakegrasp.simulation.candidates import palm_attempts
 from drakegrasp.simulation.closing import centred
 from drakegrasp.simulation.scene import Scene, hand_joint_names
-from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
+from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, run_in
 from drakegrasp.simulation.screen import Screening, screen
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.table import AnyArray, Table
 from drakegrasp.vision.camera import (
     camera_pose_otm,
@@ -61,7 +61,7 @@ class TrialSetup:
     Attributes:
         prepared: The object, its resting poses and its palm poses.
         config: Configuration of the dataset.
-        scene: Simulation of object, table and hand. A scene in which Drake failed is replaced.
+        scene: Simulation of object, table and hand. After an inconclusive trial it is replaced.
     """
 
     prepared: PreparedObject
@@ -76,7 +76,7 @@ class TrialSetup:
         return cached_scene(model, config.physics, config.hand_source, attempt.preshape)
 
     def renew_scene(self) -> None:
-        """Replace the scene, after Drake failed in it and the cache was emptied."""
+        """Replace the scene, after an inconclusive trial emptied the cache."""
         config = self.config
         self.scene = cached_scene(self.prepared.model, config.physics, config.hand_source)
 
@@ -176,11 +176,10 @@ def screen_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Scre
 def try_attempt(
     setup: TrialSetup, attempt: Attempt, screening: Screening | None = None
 ) -> TrialRecord:
-    """Run the trial of one attempt; replace the scene if Drake failed in it."""
+    """Run the trial of one attempt; replace the scene if the trial was inconclusive."""
     X_TO = setup.prepared.resting_poses[attempt.resting]
-    record = run_attempt(setup.scene_of(attempt), X_TO, attempt, setup.config, screening)
-    if record.outcome is Outcome.SOLVER_ERROR:
-        forget_scenes()
+    record = run_in(setup.scene_of(attempt), X_TO, attempt, setup.config, screening)
+    if record.outcome.inconclusive:
         setup.renew_scene()
     return record
 
@@ -321,11 +320,11 @@ def judge_sample(
 _OF_PICTURES = {"seen", "depth_variance"}
 
 
-def unjudged(rules: FilterConfig) -> tuple[Removal, ...]:
+def unjudged(config: FilterConfig) -> tuple[Removal, ...]:
     """Return the enabled filters that a verdict cannot apply."""
-    of_pictures = (rule for rule in FILTERS if rule.is_on(rules) and {*rule.needs} & _OF_PICTURES)
-    others = {Removal.OUTLIER: rules.outlier_sigma > 0.0, Removal.OWN: bool(rules.own)}
+    of_pictures = (each for each in FILTERS if each.is_on(config) and {*each.needs} & _OF_PICTURES)
+    others = {Removal.OUTLIER: config.outlier_sigma > 0.0, Removal.OWN: bool(config.own)}
     return (
-        *(rule.removal for rule in of_pictures),
+        *(each.removal for each in of_pictures),
         *(reason for reason, on in others.items() if on),
     )

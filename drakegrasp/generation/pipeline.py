@@ -144,7 +144,7 @@ class BuildReport:
         simulated: Number of work units that this build ran.
         reused: Number of work units that an earlier build completed.
         objects: Number of objects.
-        refused: Name of each rejected mesh, and the reason.
+        refused: Name of each refused mesh, and the reason.
         errors: Number of solver errors by message, in the units that this build ran.
         notices: Information for the user, such as repaired damage and removed leftover files.
         unexplained: A line for each object with so many crashes or timeouts that the machine must
@@ -176,7 +176,7 @@ def build(
 ) -> BuildReport:
     """Build or complete the dataset of some meshes in a directory.
 
-    Complete results of the same configuration and mesh are reused. Rejected meshes are reported;
+    Complete results of the same configuration and mesh are reused. Refused meshes are reported;
     the others are built.
 
     Args:
@@ -229,7 +229,7 @@ class _Build:
         # Write the manifest first, because a directory without a manifest holds no dataset.
         write_manifest(self._manifest, self._out)
 
-        # Prepare each object, or reject its mesh.
+        # Prepare each object, or refuse its mesh.
         with self._progress("prepare", "objects") as report:
             self._prepare(sources, report)
         if self._postures and (refused := _refused(self._postures, self._manifest)):
@@ -274,7 +274,7 @@ class _Build:
     # Objects
 
     def _prepare(self, sources: Sequence[MeshSource], report: Report) -> None:
-        """Prepare or reject every object, in the sources' order, and write the manifest.
+        """Prepare or refuse every object, in the sources' order, and write the manifest.
 
         Raises:
             DataError: If there is no object, or objects of two splits have become one group.
@@ -326,7 +326,7 @@ class _Build:
         before: Mapping[str, ObjectEntry | RefusedMesh],
         report: Report,
     ) -> dict[str, ObjectEntry | RefusedMesh]:
-        """Return the entry of each mesh; those that were prepared or rejected before are reused."""
+        """Return the entry of each mesh; those that were prepared or refused before are reused."""
         entries: dict[str, ObjectEntry | RefusedMesh] = {}
         for source in sources:
             known = before.get(source.name)

@@ -1,7 +1,7 @@
-"""Prepares one mesh as a task, and rejects a mesh whose preparation crashes or hangs.
+"""Prepares one mesh as a task, and refuses a mesh whose preparation crashes or hangs.
 
 Input: a mesh and the configuration, as plain data. Output: the object's files, and the entry in the
-manifest, which describes the object or states why the mesh was rejected. The task reads and hashes
+manifest, which describes the object or states why the mesh was refused. The task reads and hashes
 the mesh file once.
 """
 
@@ -133,7 +133,7 @@ def _drawing(model: ObjectModel, resting_poses: Array, config: Config) -> Drawin
 def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
     """Prepare one mesh, and return its name and its entry in the manifest.
 
-    The entry of a rejected mesh is a `RefusedMesh`. An object whose files are complete is not
+    The entry of a refused mesh is a `RefusedMesh`. An object whose files are complete is not
     prepared again.
 
     Raises:
@@ -149,7 +149,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
         if entry is not None:
             return name, entry
 
-        # The journal identifies a mesh that kills its process, which is then rejected.
+        # The journal identifies a mesh that kills its process, which is then refused.
         release_memory()
         config_hash = config.simulation_hash()
         identity = {"name": name, "mesh_sha256": digest, "config_hash": config_hash}

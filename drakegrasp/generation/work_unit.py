@@ -263,7 +263,7 @@ class _UnitRun:
                 repeats = self._repeat(row)
                 columns["robust_tried"][row] = len(repeats)
                 columns["robust_kept"][row] = sum(map(self._passes_filters, repeats))
-        # A scene in which Drake failed is no longer cached, so build it again.
+        # After an inconclusive repeat no scene is cached, so build it again.
         self._setup.renew_scene()
         return columns
 

@@ -6,7 +6,7 @@ neighbouring face, or -1 at a rim. Only an open rim that is flat or small is cer
 can be closed; other rims raise `MeshError`.
 
 Closed components may overlap, be inside of each other, and be inside out. Their union encloses each
-point at most once; one that passes through itself is rejected.
+point at most once; one that passes through itself is refused.
 """
 
 from __future__ import annotations

@@ -46,12 +46,12 @@ class AuditRow:
         name: Name of the object.
         class_name: Class of the object.
         status: "fit" without changes, "repaired", or "refused".
-        notes: What was repaired, or the one reason of the rejection.
+        notes: What was repaired, or the one reason of the refusal.
         warnings: Possible problems in a mesh that was accepted.
         faces: Number of faces of the file.
         bodies: Number of connected pieces of surface in the file.
         watertight: Whether each edge of the file has two faces that agree.
-        extents: Edges of the bounding box [m] of the solid or, if rejected, of the file.
+        extents: Edges of the bounding box [m] of the solid or, if refused, of the file.
         units_guess: Unit with which the object would have a plausible size, if it does not have one
             with the given unit; None if it does, or if no unit fits.
         volume: Volume of the solid [m^3].
@@ -93,7 +93,7 @@ def audit(
     manifest: str | Path | None = None,
     progress: Report = silent,
 ) -> list[AuditRow]:
-    """Return for each mesh whether it is fit to be simulated, needs repair, or is rejected.
+    """Return for each mesh whether it is fit to be simulated, needs repair, or is refused.
 
     Objects are prepared with the default `objects` of the configuration.
 

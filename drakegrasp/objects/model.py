@@ -4,7 +4,7 @@ An `ObjectModel` is a watertight solid in metres with its origin {O} at the cent
 box, mass properties of uniform density, and a collision mesh that is not too fine for hydroelastic
 contact. Drake accepts open, inverted and flat meshes without a warning and simulates nonsense, so
 all that it needs is checked here. Faults are repaired (`drakegrasp.mesh.repair`) and noted, or the
-mesh is rejected with a `MeshError`.
+mesh is refused with a `MeshError`.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ def make_object(
         name: Name of the object.
         class_name: Class of the object.
         mesh_sha256: Hash of the object's source.
-        unit: The assumed unit of length, for the message if the size is rejected.
+        unit: The assumed unit of length, for the message if the size is refused.
 
     Raises:
         MeshError: If the size is implausible, or the surface cannot become a solid.

@@ -146,8 +146,9 @@ class Verdict:
         lifted, precision, stable, kept: As in a dataset, wherever the fingertips touch.
         matches: Lifted, with every contact within `verify.max_contact_error` of the requested one.
         lifted_any: Whether any of at most five wrist poses holds: an oracle chose among them.
-        contact_error: Largest distance between requested and reached contacts [m]; None if a
-            fingertip did not touch; 0 for a posture that holds, because it requests no contacts.
+        contact_error: Largest distance between requested and reached contacts [m], of the
+            fingertips that touch; None if none touches; 0 for a posture that holds, because it
+            requests no contacts.
         penetration: Largest penetration after closing [m]; None if the hand did not close.
         posture: Position [m], rotation vector [rad] and joints after closing in {O}; empty if the
             hand did not close.

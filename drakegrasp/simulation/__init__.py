@@ -1,1 +1,1 @@
-"""One grasp attempt in Drake: scene, candidates, screen, trial, lift."""
+"""Grasp attempts in Drake: objects at rest, palm poses, screen, trial, lift."""

@@ -56,7 +56,8 @@ class PlacedObject:
     Attributes:
         model: Meshes and mass properties.
         X_TO: Pose in the table-top frame, (4, 4).
-        config: The configuration with which the object was prepared and dropped; default `paper`.
+        config: The configuration with which the object was prepared and dropped; by default that
+            of `load_config()`.
     """
 
     model: ObjectModel

@@ -32,6 +32,7 @@ from drakegrasp.simulation.attempt import Attempt, disturbed, usual_conditions
 from drakegrasp.simulation.closing import centred
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.screen import Screening
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
@@ -104,18 +105,29 @@ def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
 
 
 def forget_scenes() -> None:
-    """Drop every scene, because a scene in which Drake failed must not be used again."""
+    """Drop every scene, because a scene must not be used again after an inconclusive trial."""
     with _lock:
         _scenes.cache_clear()
 
 
 def run_cached(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -> TrialRecord:
-    """Return the record of an attempt in the cached scene of an object, see `run_attempt`.
-
-    A scene in which Drake failed is never used again.
-    """
+    """Return the record of an attempt in the cached scene of an object, see `run_in`."""
     scene = cached_scene(model, config.physics, config.hand_source, attempt.preshape)
-    record = run_attempt(scene, X_TO, attempt, config)
+    return run_in(scene, X_TO, attempt, config)
+
+
+def run_in(
+    scene: Scene,
+    X_TO: Array,
+    attempt: Attempt,
+    config: Config,
+    screening: Screening | None = None,
+) -> TrialRecord:
+    """Return the record of an attempt in a scene, see `run_attempt`.
+
+    After an inconclusive trial no scene of the cache is used again.
+    """
+    record = run_attempt(scene, X_TO, attempt, config, screening)
     if record.outcome.inconclusive:
         forget_scenes()
     return record

@@ -1,6 +1,6 @@
 """Predicted contacts: grasp vectors become a table of contact points and normals.
 
-Input: grasp vectors in one of four frames, as a network returned them. Output: contact points and
+Input: grasp vectors in one of five frames, as a network returned them. Output: contact points and
 unit normals in that frame, or the reason why a row is not a valid grasp. An array that cannot hold
 grasps at all is an error, with a message of one line.
 """
