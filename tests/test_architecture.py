@@ -199,8 +199,14 @@ def test_libraries_stay_in_their_rooms() -> None:
         ((), (*HEAVY, "numpy", "h5py")),
         (READERS, HEAVY),
         (CHECKERS, ("pydrake", "dask", "distributed")),
+        (("exchange.dexgraspbench",), ("matplotlib",)),
     ],
-    ids=["the package", "readers: NumPy and h5py only", "checkers: no Drake and no Dask"],
+    ids=[
+        "the package",
+        "readers: NumPy and h5py only",
+        "checkers: no Drake and no Dask",
+        "exporters: no pictures",
+    ],
 )
 def test_imports_load_nothing_heavy(modules: tuple[str, ...], names: tuple[str, ...]) -> None:
     assert loaded_by(modules, names) == "[]"

@@ -334,8 +334,12 @@ def test_filters_that_keep_more_than_lifts_that_ended_are_refused(
 
 def test_filters_may_be_as_strict_as_the_lifts_or_stricter() -> None:
     stopped = load_config(overrides=["lift.stop_when=lost_sample"])
-    override_config(stopped, ["lift.stop_slip=0.02", "lift.stop_turn_deg=20"])
-    override_config(stopped, ["filters.max_slip=0.005", "filters.max_turn_deg=5"])
+    later = override_config(stopped, ["lift.stop_slip=0.02", "lift.stop_turn_deg=20"])
+    assert (later.lift.stop_slip, later.lift.stop_turn_deg) == (0.02, 20.0)
+    assert (later.filters.max_slip, later.filters.max_turn_deg) == (0.01, 10.0)
+    strict = override_config(stopped, ["filters.max_slip=0.005", "filters.max_turn_deg=5"])
+    assert (strict.filters.max_slip, strict.filters.max_turn_deg) == (0.005, 5.0)
+    assert (strict.lift.stop_slip, strict.lift.stop_turn_deg) == (0.01, 10.0)
 
 
 def test_whole_lifts_differ_in_when_they_end_alone() -> None:

@@ -34,7 +34,7 @@ from drakegrasp.protocols.postures import (
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, count_workers, processes, run_here
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.simulation.placement import Placed, place_object
+from drakegrasp.simulation.placement import PlacedObject, place_object
 from drakegrasp.verification.placing import (
     PlacedGrasp,
     contacts_on_object,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 #: Source of an object on the table: a mesh file, a mesh, or a placed object.
-ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
+ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | PlacedObject
 #: Target of a grasp: an object, or a sample or dataset that defines the object of each grasp.
 GraspTarget: TypeAlias = ObjectMesh | Sample | GraspDataset
 
@@ -217,7 +217,7 @@ def _validate_none(on: Sample | GraspDataset, **given: object) -> None:
 
 
 def _validate_target(on: object) -> None:
-    if not isinstance(on, str | Path | trimesh.Trimesh | Placed):
+    if not isinstance(on, str | Path | trimesh.Trimesh | PlacedObject):
         raise GraspError(
             "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a Sample or a "
             f"GraspDataset, got a {type(on).__name__}"

@@ -162,8 +162,7 @@ def print_report(report: BuildReport) -> None:
     """
     from drakegrasp.cli import tables
 
-    if report.assembly is not None:
-        tables.print_stats(report.out)
+    tables.print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
         say(f"{counted(report.simulated, 'work unit')} simulated{reused}")

@@ -417,22 +417,18 @@ def _stored(group: h5py.Group, name: str, rows: slice, *, text: bool = False) ->
     return values
 
 
-def read_codes(
-    dataset: h5py.Dataset, codes: int | Sequence[int], rows: slice = slice(None)
-) -> npt.NDArray[Any]:
+def read_codes(dataset: h5py.Dataset, codes: int | Sequence[int]) -> npt.NDArray[Any]:
     """Return a column (n,) of codes, and reject codes without a defined meaning.
 
     Args:
         dataset: The column.
         codes: The number of valid codes, which are counted from 0, or the valid codes themselves.
-        rows: The rows that are read.
 
     Raises:
         DataError: If a code has no defined meaning.
     """
-    values: npt.NDArray[Any] = dataset[rows]
-    path = Path(dataset.file.filename)
-    validate_codes(path, dataset.name, values, codes, rows.start or 0)
+    values: npt.NDArray[Any] = dataset[:]
+    validate_codes(Path(dataset.file.filename), dataset.name, values, codes)
     return values
 
 

@@ -83,11 +83,6 @@ class PreparedObject:
     candidates: Candidates
     asked: int
 
-    @property
-    def X_TO(self) -> Array:
-        """The first resting pose, (4, 4)."""
-        return np.asarray(self.resting_poses[0])
-
     def entry(self) -> ObjectEntry:
         """Return the object's entry in the manifest."""
         columns = self.resting_poses, self.probability.tolist(), self.stopped.tolist()

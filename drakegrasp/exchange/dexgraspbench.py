@@ -28,7 +28,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +46,6 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.surfaces import hull_text
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.protocols.postures import POSTURES, read_grasp_file
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, run_here
@@ -56,6 +55,9 @@ from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import Posture
 from drakegrasp.verification.placing import PlacedGrasp
 from drakegrasp.verification.verify import first_fit
+
+if TYPE_CHECKING:
+    from drakegrasp.pictures.still_scene import StillScene
 
 #: Description of the format in `drakegrasp export --help`.
 HELP = (
@@ -109,6 +111,7 @@ class BenchFiles:
             folder: Folder to which object paths in the files are relative.
         """
         from drakegrasp.mjcf import make_hand_model, write_hand_model
+        from drakegrasp.pictures.still_scene import StillScene
 
         model = make_hand_model(hand)
         self.posed = StillScene(hand)

@@ -30,7 +30,6 @@ from drakegrasp.mjcf import (
     set_inertia,
 )
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.runtime.progress import Report
 from drakegrasp.vision.camera import object_colour
 
@@ -45,6 +44,8 @@ MESHES, HAND = "meshes", "hand"
 
 def write_mjcf(out: Path, folder: Path, progress: Report) -> int:
     """Write one scene per sample and return the number of scenes; see `export.export_dataset`."""
+    from drakegrasp.pictures.still_scene import StillScene
+
     config = read_manifest(out).config
     hand = load_plain_hand(config.hand_source, "scenes of MuJoCo")
     posed, count = StillScene(hand), 0

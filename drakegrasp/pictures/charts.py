@@ -126,8 +126,8 @@ def _plain(axes: Axes) -> None:
     axes.xaxis.label.set_color(INK)
 
 
-def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:
-    """Return a card as PNG with a resolution [pixels per inch]."""
+def card_picture(card: Mapping[str, Any]) -> bytes:
+    """Return a card as PNG."""
     calibrated = {n: s["calibration"] for n, s in card["sets"].items() if s["calibration"]}
     protocol = card["settings"].get("protocol")
     columns = 1 + (protocol is None) + bool(calibrated)
@@ -149,7 +149,7 @@ def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:
         panel.title.set(fontsize="medium", color=INK)
     _caption(figure, card)
 
-    return png_bytes(figure, dpi=dpi)
+    return png_bytes(figure, dpi=150)
 
 
 def _colours(card: Mapping[str, Any]) -> dict[str, str]:

@@ -39,23 +39,23 @@ NORMAL_LENGTH = 0.05
 DEPTH_OF_GRASP = 0.03
 #: Distance between neighbouring fingers of a grasp from above [m].
 FINGER_SPACING = 0.04
+#: Seed of the draws.
+SEED = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceInput:
-    """The rows to score, the training rows, and the seed of the draws.
+    """The rows to score, and the training rows.
 
     Attributes:
         data: The dataset; its split has the rows.
         rows: The rows to score.
         train: The training split; it may be empty.
-        seed: Seed of the draws.
     """
 
     data: GraspDataset
     rows: Sequence[int]
     train: GraspDataset
-    seed: int = 0
 
     @cached_property
     def train_grasps(self) -> Array:
@@ -79,7 +79,7 @@ class ReferenceInput:
 
     def stream(self, name: str, row: int) -> Stream:
         """Return the stream of a reference for a row, seeded by the trial of the row."""
-        return Stream(self.seed, object_key(name), int(self.data.value("trial_id", row)))
+        return Stream(SEED, object_key(name), int(self.data.value("trial_id", row)))
 
     def visible(self, row: int) -> Array:
         """Return the object's points p_CQ (n, 3) that the image of a row shows [m]."""
@@ -102,7 +102,7 @@ def nearest_image(inputs: ReferenceInput) -> Array:
     count = len(inputs.train)
     known = np.arange(count)
     if count > MOST_IMAGES:
-        drawn = Stream(inputs.seed, object_key("nearest image")).permutation(count)
+        drawn = Stream(SEED, object_key("nearest image")).permutation(count)
         known = np.sort(drawn[:MOST_IMAGES])
     table = np.array([_descriptor(inputs.train, int(row)) for row in known])
     nearest = []

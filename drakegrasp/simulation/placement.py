@@ -11,7 +11,6 @@ import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -34,19 +33,6 @@ from drakegrasp.simulation.trial import TrialRecord
 
 #: Largest distance of the object's lowest point from the table at a given pose [m].
 MAX_GAP = 0.005
-
-
-@runtime_checkable
-class Placed(Protocol):
-    """An object with a pose: a `PlacedObject`, or a prepared object of a dataset."""
-
-    @property
-    def model(self) -> ObjectModel:
-        """The object."""
-
-    @property
-    def X_TO(self) -> Array:
-        """Pose of the object in the table-top frame, (4, 4)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,7 +63,7 @@ class PlacedObject:
 
 @one_thread
 def place_object(
-    mesh: str | Path | trimesh.Trimesh | Placed,
+    mesh: str | Path | trimesh.Trimesh | PlacedObject,
     *,
     units: str | None = None,
     X_TO: npt.ArrayLike | None = None,
@@ -109,11 +95,10 @@ def place_object(
     validate_units(units or "m")
 
     # Prepare the object, unless it is already prepared.
-    if isinstance(mesh, Placed):
+    if isinstance(mesh, PlacedObject):
         if units is not None:
             raise MeshError(f"units must be None for a prepared object, got {units!r}")
-        if isinstance(mesh, PlacedObject):
-            validate_same_objects(config, mesh.config, "as the object was placed with")
+        validate_same_objects(config, mesh.config, "as the object was placed with")
         model, known = mesh.model, np.asarray(mesh.X_TO)
     elif isinstance(mesh, trimesh.Trimesh):
         model, known = _model_of(mesh, units or "m", config), None

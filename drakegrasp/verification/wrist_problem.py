@@ -475,7 +475,7 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     dpad_G -= np.matmul(skew(pad_G), spin)
 
     # Closing direction v, which also turns with the palm.
-    closing, dclosing = _closing_direction(constants, p_GQ, axes, arms, velocity)
+    closing, dclosing = _closing_direction(constants, axes, arms, velocity)
     dclosing[:, :, :3] -= np.matmul(skew(closing), spin_G)
 
     # The residuals and their derivatives, term by term.
@@ -563,7 +563,7 @@ def _forward(constants: HandConstants, coordinates: Array) -> tuple[Array, Array
 
 
 def _closing_direction(
-    constants: HandConstants, p_GQ: Array, axes: Array, arms: Array, velocity: Array
+    constants: HandConstants, axes: Array, arms: Array, velocity: Array
 ) -> tuple[Array, Array]:
     """Return the unit direction in which each fingertip moves at Q when its finger closes.
 
@@ -577,7 +577,6 @@ def _closing_direction(
 
     Args:
         constants: Constants of the hand.
-        p_GQ: (k, 3), the predicted points in {G} [m].
         axes: (m, k, 3), axes of the joints in {G}; zero if they slide.
         arms: (m, k, 3), velocity at Q per position of each joint, in {G} [m/rad, or -].
         velocity: (k, 3, n), velocity of the fingertips' material points at Q per unknown, in {G}.

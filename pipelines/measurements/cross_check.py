@@ -213,7 +213,7 @@ def _try_object(
     from mujoco_baseline import MujocoBaseline
 
     prepared = load_prepared(out, name, config)
-    peer = MujocoBaseline(prepared.model, prepared.X_TO, config)
+    peer = MujocoBaseline(prepared.model, prepared.resting_poses[0], config)
     usual = usual_conditions(prepared.model, config.physics)
     for lift in lifts:
         peer.place(prepared.resting_poses[lift.resting])

@@ -125,7 +125,7 @@ def prepared_objects(
         config = manifest.config
         thing = load_prepared(out, name, config)
         changed = override_config(config, list(overrides))
-        return PlacedObject(model=thing.model, X_TO=thing.X_TO, config=changed)
+        return PlacedObject(model=thing.model, X_TO=thing.resting_poses[0], config=changed)
 
     for entry in manifest.objects:
         yield entry.name, partial(at_rest, entry.name)

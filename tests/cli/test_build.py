@@ -216,7 +216,9 @@ def test_files_of_two_states_are_a_finding(out: Path) -> None:
 
 def _crash(*arguments: object) -> TrialRecord:
     setup, attempt = arguments[:2]
-    return TrialRecord(outcome=Outcome.CRASHED, X_TO=setup.prepared.X_TO, X_OG=attempt.X_OG)
+    return TrialRecord(
+        outcome=Outcome.CRASHED, X_TO=setup.prepared.resting_poses[0], X_OG=attempt.X_OG
+    )
 
 
 @pytest.mark.sim

@@ -80,7 +80,7 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     config = load_config(overrides=["candidates.max=1000"])
     hand = load_hand(config.hand)
     prepared = prepare(source, config)
-    model, candidates = prepared.model, prepared.candidates
+    model, candidates, rest = prepared.model, prepared.candidates, prepared.resting_poses[0]
     attempts = list(
         palm_attempts(
             candidates, range(len(candidates)), config.candidates, name=source.name, seed=7
@@ -90,7 +90,7 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     # The resting pose is simulated. That of the cylinder, which may turn about its axis, was not
     # the same on every machine: of it only height and upward direction are compared.
     round_base = source.name == "2_cylinder"
-    yield "X_TO", digest(np.round(prepared.X_TO[2], 4) + 0.0 if round_base else prepared.X_TO)
+    yield "X_TO", digest(np.round(rest[2], 4) + 0.0 if round_base else rest)
     yield "palm poses", digest(candidates.X_OG, candidates.distance)
     yield (
         "attempts",
@@ -109,7 +109,7 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     X_TO = make_pose(R_TO, [0.1, 0.2, model.half_extents[2]])
     closing = Drawing(model, X_TO, load_config("fast")).candidates(CLOSING)
     yield "closing", digest(closing.X_OG, closing.spread)
-    screenings = screen(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
+    screenings = screen(model, hand, rest, attempts[:PREDICTED], config.screen)
     yield (
         "predictions",
         digest(

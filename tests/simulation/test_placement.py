@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers.objects import box_model, standing
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -17,8 +16,6 @@ from drakegrasp.errors import GraspError, MeshError
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.simulation.placement import (
-    Placed,
-    PlacedObject,
     canonical_pose,
     place_object,
 )
@@ -118,22 +115,6 @@ def test_placed_object_stays_as_it_is() -> None:
     moved = make_pose(np.eye(3), [0.0, 0.3, 0.05])
     np.testing.assert_array_equal(place_object(first, X_TO=moved).X_TO, moved)
     np.testing.assert_array_equal(first.X_TO, X_TO)
-
-
-def test_anything_with_a_model_and_a_pose_is_an_object(tmp_path: Path) -> None:
-    """As a dataset's prepared object is."""
-
-    class Prepared:
-        model = box_model(tmp_path, EXTENTS)
-        X_TO = standing(model)
-        candidates = None
-
-    assert isinstance(Prepared(), Placed)
-    assert not isinstance(box(), Placed)
-    placed = place_object(Prepared())
-    assert type(placed) is PlacedObject
-    assert placed.model is Prepared.model
-    np.testing.assert_array_equal(placed.X_TO, Prepared.X_TO)
 
 
 # Poses
