@@ -25,7 +25,7 @@ images, and `o` is the number of objects in a scene. Frames are explained in
 
 ```
 OUT/
-  manifest.json            configuration, its hash, seed, versions, objects, rejected meshes
+  manifest.json            configuration, its hash, seed, versions, objects, refused meshes
   hand/                    the hand: hand file, model, meshes, licences
   objects/NAME.npz         an object: meshes, mass, centre of mass, inertia
   objects/NAME.plan.h5     its resting pose and palm poses
