@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 #: In place of the date in the title of a version that is not released yet.
 UNRELEASED = "unreleased"
 #: Maximum number of lines of a release's section in the changelog, so that users read it.
-SECTION_LINES = 60
+SECTION_LINES = 70
 
 
 def main(argv: Sequence[str] | None = None) -> int:
