@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
+    from drakegrasp.reach.arm import Arm, load_arm
+    from drakegrasp.reach.rows import reach_dataset
     from drakegrasp.scoring.predicting import propose
     from drakegrasp.scoring.ranking import Ranking, rank
     from drakegrasp.scoring.run import Score
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
 
 #: The module of each name.
 _HOMES = {
+    "Arm": "reach.arm",
     "BlankImageError": "errors",
     "BuildReport": "generation.pipeline",
     "Config": "config",
@@ -82,6 +85,7 @@ _HOMES = {
     "cloud_from_depth": "vision.depth_image",
     "connect": "cluster.connect",
     "fit_table": "vision.depth_image",
+    "load_arm": "reach.arm",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
     "make_benchmark": "api.building",
@@ -90,6 +94,7 @@ _HOMES = {
     "place_object": "simulation.placement",
     "propose": "scoring.predicting",
     "rank": "scoring.ranking",
+    "reach_dataset": "reach.rows",
     "replay_trial": "generation.replay",
     "run_trial": "simulation.placement",
     "score": "api.scoring",
@@ -100,6 +105,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "Arm",
     "BlankImageError",
     "BuildReport",
     "Config",
@@ -130,6 +136,7 @@ __all__ = [
     "cloud_from_depth",
     "connect",
     "fit_table",
+    "load_arm",
     "load_config",
     "load_hand",
     "make_benchmark",
@@ -138,6 +145,7 @@ __all__ = [
     "place_object",
     "propose",
     "rank",
+    "reach_dataset",
     "replay_trial",
     "run_trial",
     "score",

@@ -24,6 +24,7 @@ COMMANDS = {
     "assemble": ("datasets:assemble", "Filter and split again, without simulating."),
     "merge": ("datasets:merge", "Merge several datasets that were built separately."),
     "scenes": ("datasets:scenes", "Render views of training scenes, independent of grasps."),
+    "reach": ("reach:reach", "Ask whether an arm gets its hand to the samples."),
     "check": ("datasets:check", "Check every invariant of a dataset."),
     "stats": ("datasets:stats", "Count outcomes, how well grasps hold, and samples."),
     "inspect": ("datasets:inspect", "Look at grasps in a browser, and reject them."),

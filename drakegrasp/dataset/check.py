@@ -24,6 +24,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import file_attributes, shards_sha256
 from drakegrasp.dataset.hdf5 import (
+    REACH,
     SAMPLES,
     SCENES,
     TRIALS,
@@ -43,6 +44,8 @@ from drakegrasp.dataset.paths import (
     TRIALS_FILE,
     model_path,
     plan_path,
+    reach_names,
+    reach_path,
     recorded_model,
     validate_model_file,
 )
@@ -79,7 +82,7 @@ from drakegrasp.vision.camera import project
 
 #: Number of rows in a task: some 20 MB.
 TASK_ROWS = 1024
-#: Layouts of the files.
+#: Layouts of the files; all others are of arms.
 FILES: Mapping[str, Layout] = {
     TRIALS_FILE: TRIALS,
     **dict.fromkeys(DATA_FILES.values(), SAMPLES),
@@ -201,13 +204,14 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     with suppress(DataError):  # a missing shard is found with its object
         seals = shards_sha256(out, manifest)
     cameras = {name: camera for camera, name in DATA_FILES.items()}
-    for name in FILES:
+    arms = [reach_path(out, name).relative_to(out).as_posix() for name in reach_names(out)]
+    for name in (*FILES, *arms):
         if name == SCENES_FILE and not (out / name).exists():
             continue
         with _reported(found, name, "the file must be there, readable and of this schema"):
             due = file_attributes(manifest, seals, cameras.get(name, ""))
             known = {key: value for key, value in due.items() if key != "shards" or seals}
-            headers[name] = _header(out / name, known, found)
+            headers[name] = _header(out / name, name, known, found)
 
     units = zip(manifest.objects, manifest.headers_by_object(), strict=True)
     tasks: list[Task] = [partial(_check_object, out, entry, own) for entry, own in units]
@@ -216,12 +220,13 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     sound = trials is not None and not trials.mistakes
     sound = sound and not any(header.other for header in headers.values())
     for name, header in headers.items():
-        compared = sound and name in cameras and not header.mistakes
-        if compared:
+        compared = sound and (name in cameras or name in arms) and not header.mistakes
+        if compared and name in cameras:
             tasks.append(partial(_samples, out / name))
-        tasks.append(partial(_seal, out / name))
+        tasks.append(partial(_seal, out / name, name))
         rows = _Rows(
             path=out / name,
+            name=name,
             stamp=stamp(out / name),
             attributes=header.attributes,
             counts={**(trials.counts if compared and trials else {}), **header.counts},
@@ -235,15 +240,16 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     return found, tasks
 
 
-def _header(path: Path, due: Mapping[str, Any], found: list[Violation]) -> _Header:
+def _header(path: Path, name: str, due: Mapping[str, Any], found: list[Violation]) -> _Header:
     """Check the attributes and the layout of a file; no row is read.
 
     Args:
         path: Path of the file.
+        name: The same within the dataset.
         due: The attributes that the file would be written with now, as far as they are known.
         found: Gets the violations.
     """
-    layout = FILES[path.name]
+    layout = FILES.get(name, REACH)
     with open_hdf5(path) as file:
         validate_schema_version(path, file.attrs.get("schema_version"))
         wrong = list(mistakes(file, layout))
@@ -253,26 +259,29 @@ def _header(path: Path, due: Mapping[str, Any], found: list[Violation]) -> _Head
         counts = {g: len(file[g][layout.tables[g][0].name]) for g in layout.tables if g in read}
         attributes = dict(file.attrs)
     for each in wrong:
-        found.append(Violation(file=path.name, group=each.path, what=each.what, got=each.got))
+        found.append(Violation(file=name, group=each.path, what=each.what, got=each.got))
 
     # The first other attribute is the cause of the others. Verdicts may get other settings, which
-    # are in `config`; scenes have their own attributes.
-    keys = STATE if path.name == SCENES_FILE else dict.fromkeys((*STATE, *due))
+    # are in `config`; scenes and arms have their own attributes.
+    keys, command = [*dict.fromkeys((*STATE, *due))], "assemble"
+    if name == SCENES_FILE:
+        keys, command = [*STATE], "scenes"
+    elif name not in FILES:
+        keys, command = ["config_hash", "shards"], "reach"
     told = [key for key in keys if key in due and key in attributes and key != "config"]
     other = next((key for key in told if not np.array_equal(attributes[key], due[key])), "")
     if other:
         of = "the shards that are there" if other == "shards" else MANIFEST_FILE
-        command = "scenes" if path.name == SCENES_FILE else "assemble"
         again = f"another; run `drakegrasp {command}` again"
         what = f"attribute {other} must be that of {of}"
-        found.append(Violation(file=path.name, what=what, got=again))
+        found.append(Violation(file=name, what=what, got=again))
     return _Header(attributes=attributes, counts=counts, mistakes=bool(wrong), other=bool(other))
 
 
-def _seal(path: Path) -> list[Violation]:
+def _seal(path: Path, name: str) -> list[Violation]:
     """Return a violation if a file is not as it was written."""
     found = list[Violation]()
-    with _reported(found, path.name, "the file must be as it was written"):
+    with _reported(found, name, "the file must be as it was written"):
         validate_seal(path, "file", None)
     return found
 
@@ -349,6 +358,7 @@ class _Rows:
 
     Attributes:
         path: Path of the file, whose layout is that of the schema.
+        name: The same within the dataset.
         stamp: State of the file, see `drakegrasp.dataset.trials.stamp`.
         attributes: Attributes of the file.
         counts: Number of rows of the groups that the group's rows refer to, as far as known.
@@ -359,6 +369,7 @@ class _Rows:
     """
 
     path: Path
+    name: str
     stamp: Stamp
     attributes: Mapping[str, Any]
     counts: Mapping[str, int]
@@ -370,7 +381,7 @@ class _Rows:
     @property
     def fields(self) -> tuple[Field, ...]:
         """Fields of the group."""
-        return FILES[self.path.name].tables[self.group]
+        return FILES.get(self.name, REACH).tables[self.group]
 
 
 #: The words of a rule, the rows (n,) that break it, and what they have instead (n, ...).
@@ -390,7 +401,7 @@ def _check_rows(task: _Rows) -> list[Violation]:
     """
     # The seal proves that images are intact, and no rule here is about their colours and depths.
     names = [f.name for f in task.fields if not (f.sample and f.limits is None)]
-    violation = partial(Violation, file=task.path.name, group=f"/{task.group}")
+    violation = partial(Violation, file=task.name, group=f"/{task.group}")
     with reopened(task.path, task.stamp, "a file of a dataset") as file:
         group = file[task.group]
         try:
@@ -409,6 +420,10 @@ def _check_rows(task: _Rows) -> list[Violation]:
         stages += [[_chain], [_in_mask]]
         if task.max_distance is not None:
             stages += [[_as_in_trials], [_on_mesh]]
+    elif task.group == "reach":
+        stages += [[_as_reached]]
+        if task.max_distance is not None:
+            stages += [[_of_grasp]]
     found = list[Violation]()
     for checks in stages:
         sound = np.ones(t.count, dtype=np.bool_)
@@ -570,6 +585,26 @@ def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) ->
     with np.errstate(invalid="ignore"):
         near = np.abs(values - due) <= limit.reshape(-1, *(1,) * (values.ndim - 1))
     return _any(~(same | near))
+
+
+# What an arm can do about grasps
+
+
+def _as_reached(t: Table, task: _Rows) -> Iterator[Finding]:
+    """A grasp is reachable with this outcome, and only then there are joint positions."""
+    bad = t["reachable"] != (t["reach_outcome"] == 0)
+    yield "reachable must be true exactly where reach_outcome is 0", bad, t["reachable"]
+    for name in ("q_approach", "q_grasp", "q_lift", "clearance"):
+        values = t[name].reshape(t.count, -1)
+        bad = (np.isfinite(values) != t["reachable"][:, None]).any(axis=1)
+        yield f"{name} must be finite where the grasp is reachable, and NaN elsewhere", bad, values
+
+
+def _of_grasp(t: Table, task: _Rows) -> Iterator[Finding]:
+    """Rows are of the grasps of their trials."""
+    own = Trials(task.path.parent.parent)[t["trial_id"]]
+    for name, of in (("object", "object_name"), *((n, n) for n in ("candidate", "standoff_index"))):
+        yield f"{name} must be that of the trial", t[name] != own[of], t[name]
 
 
 # What samples are

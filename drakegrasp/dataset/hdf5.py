@@ -26,6 +26,7 @@ from drakegrasp.dataset.schema import (
     CAMERAS,
     DATA_TABLES,
     LETTERS,
+    REACH_TABLES,
     SCENE_TABLES,
     TRIAL_TABLES,
     Field,
@@ -203,6 +204,10 @@ _KINDS: Mapping[str, Callable[[Any], bool]] = {
     "a matrix of 3 x 3 numbers": lambda value: (
         isinstance(value, np.ndarray) and value.shape == (3, 3) and value.dtype.kind == "f"
     ),
+    "X, Y, Z and yaw": lambda value: np.shape(value) == (4,) and bool(np.isfinite(value).all()),
+    "a pose of 12 numbers": lambda value: (
+        np.shape(value) == (12,) and bool(np.isfinite(value).all())
+    ),
     "one of oto, otm": lambda value: isinstance(value, str) and value in CAMERAS,
     "one of class, object": lambda value: isinstance(value, str) and value in ("class", "object"),
 }
@@ -222,6 +227,14 @@ ORIGIN: Kinds = {
 OF_CAMERA: Kinds = {**ORIGIN, "camera": "one of oto, otm", "split_by": "one of class, object"}
 #: Attributes of scenes.hdf5, whose views have their own camera matrices.
 OF_SCENES: Kinds = {key: kind for key, kind in ORIGIN.items() if key != "K"}
+#: Attributes of files of arms, which have no images.
+OF_REACH: Kinds = {
+    **{key: kind for key, kind in OF_SCENES.items() if key not in ("near", "far", "signature")},
+    **dict.fromkeys(("arm", "arm_sha256", "flange"), "a text"),
+    "arm_joints": "a list in JSON",
+    "base": "X, Y, Z and yaw",
+    "mount": "a pose of 12 numbers",
+}
 
 
 class Layout(NamedTuple):
@@ -238,10 +251,11 @@ class Layout(NamedTuple):
     tables: Tables
 
 
-#: Layouts of grasping_oto.hdf5 and grasping_otm.hdf5, trials.hdf5, scenes.hdf5.
+#: Layouts of grasping_oto.hdf5 and grasping_otm.hdf5, trials.hdf5, scenes.hdf5, reach/NAME.hdf5.
 SAMPLES = Layout("a data file of drakegrasp", OF_CAMERA, DATA_TABLES)
 TRIALS = Layout("the trials of a dataset", ORIGIN, TRIAL_TABLES)
 SCENES = Layout("the scenes of a dataset", OF_SCENES, SCENE_TABLES)
+REACH = Layout("the reach of an arm", OF_REACH, REACH_TABLES)
 
 
 def mistakes(file: h5py.File, layout: Layout) -> Iterator[Difference]:
@@ -269,8 +283,8 @@ def _opened_whole(path: Path, layout: Layout) -> Iterator[h5py.File]:
 
 #: Context managers that open a file of a dataset, given its path. They raise a DataError if the
 #: file is missing, damaged, or differs from its layout.
-open_samples, open_trials, open_scenes = (
-    partial(_opened_whole, layout=layout) for layout in (SAMPLES, TRIALS, SCENES)
+open_samples, open_trials, open_scenes, open_reach = (
+    partial(_opened_whole, layout=layout) for layout in (SAMPLES, TRIALS, SCENES, REACH)
 )
 
 

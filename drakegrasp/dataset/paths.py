@@ -16,6 +16,8 @@ TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 SCENES_FILE = "scenes.hdf5"
 MANIFEST_FILE = "manifest.json"
+#: Folder of the files of arms, see `reach_path`.
+REACH_FOLDER = "reach"
 #: Files that `assemble` writes; they always belong to one state.
 ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
@@ -32,6 +34,16 @@ def model_path(out: Path, name: str) -> Path:
 def plan_path(out: Path, name: str) -> Path:
     """Return the path of an object's resting pose and palm poses."""
     return out / "objects" / f"{_file_name(name)}.plan.h5"
+
+
+def reach_path(out: Path, name: str) -> Path:
+    """Return the path of what an arm, by a name of its own, can do about the grasps."""
+    return out / REACH_FOLDER / f"{_file_name(name)}.hdf5"
+
+
+def reach_names(out: Path) -> list[str]:
+    """Return the names of the arms that a dataset has files of."""
+    return sorted(path.stem for path in (out / REACH_FOLDER).glob("*.hdf5"))
 
 
 def object_files(out: Path, name: str) -> tuple[Path, Path]:

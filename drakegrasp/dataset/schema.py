@@ -26,7 +26,7 @@ OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in anot
 
 SPLITS = ("train", "valid", "test")
 #: Letters in the shapes of fields, see `Field`.
-LETTERS = ("k", "j", "S", "h", "w", "o")
+LETTERS = ("k", "j", "S", "h", "w", "o", "a")
 #: Units in which people read numbers, and the factors that convert SI values to them.
 SHOWN_UNITS = {"": 1.0, "s": 1.0, "N": 1.0, "kg": 1.0, "mm": 1e3, "°": float(np.rad2deg(1.0))}
 CAMERAS = ("oto", "otm")
@@ -108,7 +108,7 @@ class Field:
         shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer or a
             letter: `k` fingers, `j` joints of the hand, `6k` length of a grasp (18 for three
             fingers), `S` size of an image [px]; in scenes.hdf5 `h` rows and `w` columns of an image
-            [px], `o` objects of a scene.
+            [px], `o` objects of a scene; in files of arms `a` joints of the arm.
         unit: SI unit, or "-".
         frame: Letter of the frame in which the field is expressed, or "-".
         stage: First stage at which a row has a value; before it, floats are NaN and other types 0.
@@ -725,6 +725,30 @@ SCENE_OBJECT_FIELDS: tuple[Field, ...] = (
           f"{SURFACE_POINTS} 3", frame="O", sample=True),
 )
 
+#: What an arm can do about a grasp: all of it, or where the branch ends that comes farthest.
+REACHES = ("reachable", "out_of_reach", "collision", "approach", "lift")
+
+#: A row per grasp that an arm was asked for, in `/reach` of reach/NAME.hdf5.
+REACH_FIELDS: tuple[Field, ...] = (
+    Field("object", "str", "name of the object"),
+    *(field for field in TRIAL_FIELDS if field.name in ("candidate", "standoff_index")),
+    Field("trial_id", "int64", "row of trials.hdf5"),
+    Field("reachable", "bool", "whether one branch of the arm's inverse kinematics has the "
+          "approach, the grasp and the lift, within joint limits, without a jump or a collision"),
+    Field("reach_outcome", "uint8", "0 reachable; otherwise where the branch ends that comes "
+          "farthest: 1 out_of_reach, no joint positions for the palm pose; 2 collision at the palm "
+          "pose; 3 approach, also if the hand itself collides there; 4 lift",
+          limits=(0, len(REACHES) - 1)),
+    *(Field(name, "float64", f"positions of the arm's joints {when}; NaN if not reachable", "a",
+            "rad or m", some=True)
+      for name, when in (("q_approach", "at the start of the approach"),
+                         ("q_grasp", "at the palm pose of the grasp"),
+                         ("q_lift", "at the end of the lift"))),
+    Field("clearance", "float64", "least distance, all the way, of arm and hand from the table, and "
+          "of the arm and the open hand from the object; at most 0.2, NaN if not reachable",
+          unit="m", some=True, shown=Shown("clearance of the arm", "mm")),
+)
+
 #: A row per predicted grasp, in `/rows` of the results for rows of a dataset.
 PREDICTED_ROW_FIELDS: tuple[Field, ...] = (
     Field("row", "int64", "row of the dataset's split to which the grasp belongs"),
@@ -747,6 +771,7 @@ SCENE_TABLES: Tables = {
     "grasps": SCENE_GRASP_FIELDS,
     "visible": VISIBLE_FIELDS,
 }
+REACH_TABLES: Tables = {"reach": REACH_FIELDS}
 #: Columns that number the rows of another group, by their group.
 ROW_NUMBERS: Mapping[str, Mapping[str, str]] = {
     "trials": {"object": "objects"},
@@ -755,5 +780,6 @@ ROW_NUMBERS: Mapping[str, Mapping[str, str]] = {
     "scenes": {"object": "objects"},
     "views": {"scene": "scenes"},
     "grasps": {"scene": "scenes"},
+    "reach": {"trial_id": "trials"},
     "visible": {"view": "views", "grasp": "grasps"},
 }

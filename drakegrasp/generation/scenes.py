@@ -427,22 +427,36 @@ def _grasps(task: SceneTask, prepared: PreparedObject, X_TO: Array) -> Columns:
     return {name: values for name, values in columns.items() if name in stored} | {
         "scene": scene.astype(np.int64),
         "object": np.zeros(len(scene), dtype=np.int64),
-        "q_open": _open_hands(task, prepared, trials),
+        "q_open": open_hands(prepared, task.config, task.joints, trials),
     }
 
 
-def _open_hands(task: SceneTask, prepared: PreparedObject, trials: Columns) -> Array:
-    """Return the positions (n, j) of the hand's joints before it closes."""
-    hand, known = load_hand(task.config.hand_source), dict[tuple[float, int], Array]()
-    rows = np.zeros((len(trials["spread"]), len(task.joints)))
+#: Columns of trials that `open_hands` needs.
+OPEN_FOLLOWS_FROM = ("spread", "preshape", "source", "candidate", "standoff_index")
+
+
+def open_hands(
+    prepared: PreparedObject, config: Config, joints: Sequence[str], trials: Columns
+) -> Array:
+    """Return the positions (n, j) of the hand's joints before it closes.
+
+    Args:
+        prepared: The object of the trials.
+        config: Configuration of the dataset.
+        joints: Names of the joints, in the order of the files.
+        trials: Columns OPEN_FOLLOWS_FROM of n trials.
+    """
+    hand, known = load_hand(config.hand_source), dict[tuple[float, int], Array]()
+    rows = np.zeros((len(trials["spread"]), len(joints)))
     for i, spread in enumerate(trials["spread"].tolist()):
         if trials["source"][i] == Source.POSTURES:
-            rows[i] = _given_start(task, prepared, hand, {n: int(trials[n][i]) for n in _IDENTITY})
+            identity = {name: int(trials[name][i]) for name in _IDENTITY}
+            rows[i] = _given_start(prepared, config, joints, hand, identity)
             continue
         key = spread, int(trials["preshape"][i])
         if key not in known:
             shaped = hand.at(None if key[1] == NO_PRESHAPE else key[1])
-            known[key] = _positions(task, shaped, spread, np.zeros(shaped.num_fingers))
+            known[key] = _positions(joints, shaped, spread, np.zeros(shaped.num_fingers))
         rows[i] = known[key]
     return rows
 
@@ -452,17 +466,21 @@ _IDENTITY = ("candidate", "standoff_index")
 
 
 def _given_start(
-    task: SceneTask, prepared: PreparedObject, hand: Hand, identity: Mapping[str, int]
+    prepared: PreparedObject,
+    config: Config,
+    joints: Sequence[str],
+    hand: Hand,
+    identity: Mapping[str, int],
 ) -> Array:
     """Return the positions (j,) of the joints from which the hand of a posture closes."""
-    attempt = find_attempt(prepared, **identity, config=task.config)
+    attempt = find_attempt(prepared, **identity, config=config)
     if attempt.path is not None:
         return attempt.path[0]
     shaped = hand.at(attempt.preshape)
     closing = np.zeros(shaped.num_fingers) if attempt.closing is None else attempt.closing
-    return _positions(task, shaped, attempt.spread, closing)
+    return _positions(joints, shaped, attempt.spread, closing)
 
 
-def _positions(task: SceneTask, hand: Hand, spread: float, closing: Array) -> Array:
+def _positions(joints: Sequence[str], hand: Hand, spread: float, closing: Array) -> Array:
     named = joint_positions(hand, spread, closing)
-    return np.array([named[name] for name in task.joints])
+    return np.array([named[name] for name in joints])

@@ -49,7 +49,7 @@ def link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
     """
     shapes = {}
     for link, inspector, geometries in _links(model):
-        found = tuple(_corners(inspector, geometry) for geometry in geometries)
+        found = tuple(shape_corners(inspector, geometry) for geometry in geometries)
         reach = max((float(np.abs(corners).max()) for corners in found), default=0.0)
         if not reach <= FARTHEST:
             raise HandError(
@@ -90,7 +90,7 @@ def _rims(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     """Return the rows of `link_rims` of one shape."""
     shape = inspector.GetShape(geometry)
     if not isinstance(shape, Cylinder | Capsule | Sphere):
-        corners = _corners(inspector, geometry)
+        corners = shape_corners(inspector, geometry)
         return np.column_stack([corners, np.zeros((len(corners), 4))])
     X_BS = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
     half = 0.0 if isinstance(shape, Sphere) else shape.length() / 2.0
@@ -173,7 +173,7 @@ def hull_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array 
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
 
 
-def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+def shape_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     """Return the corners of a shape in its body's frame."""
     # A mesh has a hull.
     shape, corners = inspector.GetShape(geometry), hull_corners(inspector, geometry)

@@ -33,6 +33,7 @@ OUT/
   trials.hdf5              a row per attempt, whatever its outcome
   grasping_oto.hdf5        samples; the camera is rolled with the palm
   grasping_otm.hdf5        the same samples; up in the image is up in the world
+  reach/NAME.hdf5          which samples an arm reaches; on request
   scenes.hdf5              views that do not depend on a grasp, and all closed hands; on request
   reject.json              grasps that an inspection rejects; only if there are any
   build.lock               process that builds; only while a build runs
@@ -156,6 +157,19 @@ each, gzip 1. Unlike in the data files, values are NaN where no lift was tried.
 ### /scenes
 """
 
+_REACH = """
+## reach/NAME.hdf5
+
+`drakegrasp reach` writes such a file for an arm, see [the guide](../how-to/reach.md). A row belongs
+to the attempt of `object`, `candidate` and `standoff_index`, also after the dataset grew. The file
+has the attributes of `trials.hdf5` except `signature`, `K`, `near` and `far`, and those of the arm:
+its name `arm`, a hash `arm_sha256` of its file and meshes, `flange`, the names `arm_joints` of its
+joints (JSON), `base` (X, Y, Z and yaw of its first link in {T} [m, rad]) and `mount` (X_FB, the
+hand's palm link on the flange). `a` is the number of its joints.
+
+### /reach
+"""
+
 _VERIFICATION = """
 ## The results of `drakegrasp verify`
 
@@ -199,6 +213,7 @@ _TABLES = (
     ("\n### /grasps\n", schema.SCENE_GRASP_FIELDS, False),
     ("\n### /visible\n", schema.VISIBLE_FIELDS, False),
     ("\n### /objects of scenes.hdf5\n", schema.SCENE_OBJECT_FIELDS, False),
+    (_REACH, schema.REACH_FIELDS, False),
     (_SHARDS, schema.LOOK_FIELDS, False),
     (_VERIFICATION, schema.VERIFICATION_FIELDS, True),
     (_ROWS, schema.PREDICTED_ROW_FIELDS, False),

@@ -1,0 +1,1 @@
+"""Whether a robot arm gets its hand to a grasp: arms, branches, collisions, rows of a dataset."""

@@ -1,0 +1,184 @@
+"""Whether an arm gets its hand to a grasp, straight in and straight up.
+
+Input: a `Cell`, an object on the table and a `Grasp`: palm pose and the hand's joints before and
+after closing. Output: a `Reach`. The hand comes 10 cm straight along the palm's +Gz to the palm
+pose, closes there, and goes straight to the end of the trial's lift, with the object in it. The arm
+must do all of it in one branch of its inverse kinematics, without a jump, within its joint limits
+and without a collision. How it comes to the start of the approach is not planned.
+
+The hand's own way along the approach does not depend on the arm, and is decided first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drakegrasp.arithmetic import norm
+from drakegrasp.dataset.schema import REACHES
+from drakegrasp.frames import Array, invert_pose
+from drakegrasp.hand.finger_sweep import link_points
+from drakegrasp.hand.kinematics import posed_links
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.reach.branches import find_branches, follow
+from drakegrasp.reach.cell import FIRST, NEAR, Cell
+from drakegrasp.simulation.screen import COVERED, PointLookup
+
+#: Length of the straight approach [m].
+APPROACH = 0.10
+#: Distance between two configurations on a path, and between two places of the open hand [m].
+STEP, HAND_STEP = 0.02, 0.005
+#: Largest motion of a joint in a step of a path [rad or m]: at 0.1 m/s it is 1.5 rad/s.
+JUMP = 0.3
+#: An open hand that is deeper in object or table than this collides on its way [m]. It is the
+#: margin with which attempts are screened, see `ScreenConfig.start_margin`.
+HAND_MARGIN = 0.0025
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grasp:
+    """A grasp of an object on the table, as an arm sees it.
+
+    Attributes:
+        X_TO: Pose (4, 4) of the object.
+        X_TG: Pose (4, 4) of the palm at the grasp.
+        q_open, q_closed: (j,), joints of the hand before and after closing [rad or m].
+        p_TG_lifted: (3,), where the lift takes the palm's origin [m].
+    """
+
+    X_TO: Array
+    X_TG: Array
+    q_open: Array
+    q_closed: Array
+    p_TG_lifted: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reach:
+    """What an arm can do about a grasp.
+
+    Attributes:
+        outcome: One of REACHES: that of the branch which comes farthest.
+        q: (3, a), joints at the start of the approach, at the grasp and at the end of the lift;
+            NaN if the grasp is not reachable.
+        clearance: Least distance [m] of arm and hand from the table, and of the arm and the open
+            hand from the object, all the way; at most `cell.FARTHEST`. NaN if not reachable.
+    """
+
+    outcome: str
+    q: Array
+    clearance: float
+
+    @property
+    def reachable(self) -> bool:
+        """Whether the arm gets its hand there and lifts."""
+        return self.outcome == REACHES[0]
+
+
+def reach_grasp(cell: Cell, model: ObjectModel, grasp: Grasp) -> Reach:
+    """Return what an arm can do about a grasp.
+
+    Args:
+        cell: The arm and its hand.
+        model: The object.
+        grasp: The grasp.
+    """
+    room = _room_of_hand(cell, model, grasp)
+    if room < -HAND_MARGIN - max(0.0, model.field.blur - COVERED):
+        return _unreachable(cell, "approach")
+
+    # All branches of the grasp itself, and those that collide with nothing.
+    X_GF = invert_pose(cell.X_FG)
+    branches = find_branches(cell.chain, cell.limits, grasp.X_TG @ X_GF)
+    if not len(branches):
+        return _unreachable(cell, "out_of_reach")
+    free = [
+        q
+        for q in branches
+        if _is_free(cell, model, q, grasp.q_open, grasp.X_TO)
+        and _is_free(cell, model, q, grasp.q_closed, grasp.X_TO)
+    ]
+    if not free:
+        return _unreachable(cell, "collision")
+
+    # Each branch goes back along the approach, and up.
+    back, up = approach_path(grasp), lift_path(grasp)
+    approach, approaches = follow(cell.chain, cell.limits, back @ X_GF, np.array(free), JUMP)
+    lift, lifts = follow(cell.chain, cell.limits, up @ X_GF, np.array(free), JUMP)
+    farthest = "approach"
+    carried = up @ invert_pose(grasp.X_TG) @ grasp.X_TO
+    for i, q in enumerate(free):
+        if not approaches[i] or not all(
+            _is_free(cell, model, row, grasp.q_open, grasp.X_TO) for row in approach[:, i]
+        ):
+            continue
+        farthest = "lift"
+        if lifts[i] and all(
+            _is_free(cell, model, row, grasp.q_closed, X_TO)
+            for row, X_TO in zip(lift[:, i], carried, strict=True)
+        ):
+            way = [(row, grasp.q_open, grasp.X_TO) for row in (*approach[:, i], q)]
+            way += [(q, grasp.q_closed, grasp.X_TO)]
+            way += [(row, grasp.q_closed, X) for row, X in zip(lift[:, i], carried, strict=True)]
+            return Reach(
+                outcome=REACHES[0],
+                q=np.stack([approach[-1, i], q, lift[-1, i]]),
+                clearance=min(room, *(_clearance(cell, model, *state) for state in way)),
+            )
+    return _unreachable(cell, farthest)
+
+
+def approach_path(grasp: Grasp, step: float = STEP) -> Array:
+    """Return the palm poses X_TG (m, 4, 4) from the first step before a grasp to the start."""
+    path = np.tile(grasp.X_TG, (round(APPROACH / step), 1, 1))
+    away = step * np.arange(1, len(path) + 1)
+    path[:, :3, 3] -= away[:, None] * grasp.X_TG[:3, 2]
+    return path
+
+
+def lift_path(grasp: Grasp) -> Array:
+    """Return the palm poses X_TG (m, 4, 4) from the first step after a grasp to its lift's end."""
+    way = grasp.p_TG_lifted - grasp.X_TG[:3, 3]
+    count = max(1, int(np.ceil(norm(way) / STEP)))
+    path = np.tile(grasp.X_TG, (count, 1, 1))
+    path[:, :3, 3] += np.arange(1, count + 1)[:, None] / count * way
+    return path
+
+
+def _room_of_hand(cell: Cell, model: ObjectModel, grasp: Grasp) -> float:
+    """Return the least distance [m] of the open hand from object and table on its approach."""
+    names = cell.hand_joints
+    positions = {n: np.asarray(q) for n, q in zip(names, grasp.q_open.tolist(), strict=True)}
+    surfaces = link_points(cell.hand)
+    p_GQ = np.concatenate(
+        [
+            surfaces[link] @ X_GL[:3, :3].T + X_GL[:3, 3]
+            for link, X_GL in posed_links(cell.hand, positions).items()
+        ]
+    ).astype(np.float32)
+    X_TG = approach_path(grasp, HAND_STEP)
+    X_TO = np.broadcast_to(grasp.X_TO, X_TG.shape)
+    lookup = PointLookup(model.field, X_TO, invert_pose(grasp.X_TO) @ X_TG)
+    rows = np.arange(len(lookup))
+    to_object = lookup.distances(rows, p_GQ, NEAR)
+    return float(min(to_object.min(), lookup.heights(rows, p_GQ).min()))
+
+
+def _is_free(cell: Cell, model: ObjectModel, q: Array, q_hand: Array, X_TO: Array) -> bool:
+    return cell.is_free(q, q_hand) and _from_object(cell, model, q, q_hand, X_TO) > 0.0
+
+
+def _from_object(cell: Cell, model: ObjectModel, q: Array, q_hand: Array, X_TO: Array) -> float:
+    """Return the distance [m] of the arm, without the hand, from the object."""
+    lookup = PointLookup(model.field, X_TO[None], invert_pose(X_TO)[None])
+    points = cell.arm_points(q, q_hand).astype(np.float32)
+    return float(lookup.distances(FIRST, points, NEAR).min())
+
+
+def _clearance(cell: Cell, model: ObjectModel, q: Array, q_hand: Array, X_TO: Array) -> float:
+    return min(cell.table_distance(q, q_hand), _from_object(cell, model, q, q_hand, X_TO))
+
+
+def _unreachable(cell: Cell, outcome: str) -> Reach:
+    return Reach(outcome=outcome, q=np.full((3, len(cell.limits)), np.nan), clearance=np.nan)

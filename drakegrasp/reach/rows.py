@@ -1,0 +1,239 @@
+"""What an arm can do about the grasps of a dataset: OUT/reach/NAME.hdf5.
+
+Input: an assembled dataset and an arm. Output: a file with a row per grasp that is a sample. Rows
+are known by object, palm pose and stand-off, so that a dataset which grew gets the missing rows
+only, and rows of grasps that are no samples now are kept. There is one task per object; the file
+does not depend on the workers.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import AnyArray, open_reach, read_columns, write_field
+from drakegrasp.dataset.lock import build_lock
+from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
+from drakegrasp.dataset.paths import reach_path
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.schema import REACH_FIELDS, REACHES
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import DataError
+from drakegrasp.filters import Removal
+from drakegrasp.foreign_files import validate_no_link
+from drakegrasp.frames import Array, pack_pose, unpack_pose
+from drakegrasp.generation.scenes import OPEN_FOLLOWS_FROM, open_hands
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.parsing import position_order
+from drakegrasp.reach.arm import Arm, mount_of
+from drakegrasp.reach.cell import make_cell
+from drakegrasp.reach.reaching import Grasp, reach_grasp
+from drakegrasp.runtime.environment import one_thread
+from drakegrasp.runtime.executor import Executor, in_order, run_here
+from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
+from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.table import Table
+
+#: Columns of trials from which the rows follow.
+_FOLLOW_FROM = (*OPEN_FOLLOWS_FROM, "X_TO", "X_OG", "closed_q")
+#: Columns that identify a grasp.
+_IDENTITY = ("object", "candidate", "standoff_index")
+
+
+def reach_dataset(
+    out: str | Path,
+    arm: Arm,
+    *,
+    name: str | None = None,
+    execute: Executor = run_here,
+    progress: Report = silent,
+) -> Table:
+    """Write what an arm can do about the samples of a dataset, or the rows that are missing.
+
+    Args:
+        out: Directory of an assembled dataset.
+        arm: The arm, see `load_arm`.
+        name: Name of the file; None for the arm's.
+        execute: Runs the tasks.
+        progress: Called with the number of completed objects and of all objects.
+
+    Raises:
+        ConfigError: If the arm, or the dataset's hand on it, cannot be used.
+        DataError: If there is no dataset, the dataset is damaged, another process builds in it, or
+            the file is of another arm, base or mount.
+        DiskFullError: If the disk is full.
+
+    Returns:
+        The rows (n, ...) of the file.
+    """
+    out = Path(out)
+    read_manifest(out)  # fails for a missing directory, which the lock would create
+    with build_lock(out):
+        return _reach(out, arm, reach_path(out, name or arm.name), execute, progress)
+
+
+def _reach(out: Path, arm: Arm, path: Path, execute: Executor, progress: Report) -> Table:
+    manifest, trials = read_manifest(out), Trials(out)
+    hand = load_hand(manifest.config.hand_source)
+    joints = manifest.joints or position_order(hand.model, hand.palm_link)
+    manifest, X_FB = replace(manifest, joints=joints), mount_of(arm, hand)
+    make_cell(arm, manifest.config.hand_source, X_FB)  # fails early
+    attributes = _attributes(manifest, trials, arm, X_FB)
+    old = _old_rows(path, attributes)
+    done = set(zip(*(old[key].tolist() for key in _IDENTITY), strict=True)) if old else set()
+
+    # New rows, in the order of the objects, and old rows with the numbers of their trials now.
+    tasks = list(_tasks(out, manifest, trials, arm, done))
+    parts = [old] if old is not None else []
+    progress(0, len(tasks))
+    for count, columns in enumerate(in_order(execute)(reach_object, tasks), start=1):
+        parts.append(Table(columns))
+        progress(count, len(tasks))
+    rows = Table({f.name: np.concatenate([part[f.name] for part in parts]) for f in REACH_FIELDS})
+    rows = _numbered(rows, trials)
+
+    validate_no_link(path.parent)
+    with disk_full_named(out):
+        path.parent.mkdir(exist_ok=True)
+        with atomic_hdf5(path, sealed=True) as file:
+            file.attrs.update(attributes)
+            for field in REACH_FIELDS:
+                write_field(file.require_group("reach"), field, rows[field.name])
+    return rows
+
+
+def _attributes(manifest: Manifest, trials: Trials, arm: Arm, X_FB: Array) -> dict[str, Any]:
+    origin = manifest.config, manifest.versions, manifest.fingers, manifest.joints
+    return {
+        **origin_attributes(*origin),
+        "shards": trials.attributes["shards"],
+        "arm": arm.name,
+        "arm_sha256": arm.digest,
+        "flange": arm.flange,
+        "arm_joints": json.dumps(arm.joints),
+        "base": np.array(arm.base),
+        "mount": pack_pose(X_FB),
+    }
+
+
+def _old_rows(path: Path, due: Mapping[str, Any]) -> Table | None:
+    """Return the rows of a file that is there.
+
+    Raises:
+        DataError: If it is of another arm, base or mount.
+    """
+    if not path.exists():
+        return None
+    with open_reach(path) as file:
+        for key in ("arm_sha256", "flange", "base", "mount", "config_hash"):
+            if not np.array_equal(file.attrs[key], due[key]):
+                raise DataError(
+                    f"{path}: must be of the same {key}, got another; choose another --name or "
+                    "remove the file"
+                )
+        return read_columns(file["reach"], REACH_FIELDS)
+
+
+def _tasks(
+    out: Path, manifest: Manifest, trials: Trials, arm: Arm, done: set[Any]
+) -> Iterator[ReachTask]:
+    """Yield a task per object, with its samples that have no row."""
+    samples = trials[trials["removal"] == Removal.KEPT]
+    columns = samples.columns(("object_name", "candidate", "standoff_index"))
+    keys = zip(*(values.tolist() for values in columns.values()), strict=True)
+    new = samples[np.array([key not in done for key in keys], dtype=np.bool_)]
+    names = new["object_name"]
+    for entry in manifest.objects:
+        own = new[names == entry.name]
+        yield ReachTask(
+            out=out,
+            name=entry.name,
+            config=manifest.config,
+            joints=manifest.joints,
+            arm=arm,
+            trials=own.columns(_FOLLOW_FROM),
+            trial_ids=own.trial_ids,
+        )
+
+
+def _numbered(rows: Table, trials: Trials) -> Table:
+    """Return rows in the order of their trials, with the numbers that the trials have now."""
+    now = trials.columns(("object_name", "candidate", "standoff_index"))
+    keys = zip(*(values.tolist() for values in now.values()), strict=True)
+    places = {key: number for number, key in enumerate(keys)}
+    own = zip(*(rows[key].tolist() for key in _IDENTITY), strict=True)
+    ids = np.array([places.get(key, -1) for key in own], dtype=np.int64)
+    rows = rows.with_columns({"trial_id": ids})
+    return rows[np.argsort(ids, kind="stable")][(ids < 0).sum() :]
+
+
+# The grasps of one object
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReachTask:
+    """The input of a task that asks an arm for the grasps of an object.
+
+    Attributes:
+        out: Directory of the dataset.
+        name: Name of the object.
+        config: Configuration of the dataset.
+        joints: Names of the hand's joints, in the order of the files.
+        arm: The arm.
+        trials: Columns of n grasps of trials.hdf5.
+        trial_ids: (n,), their rows there.
+    """
+
+    out: Path
+    name: str
+    config: Config
+    joints: Sequence[str]
+    arm: Arm
+    trials: Mapping[str, AnyArray]
+    trial_ids: AnyArray
+
+
+@one_thread
+def reach_object(task: ReachTask) -> dict[str, AnyArray]:
+    """Return the columns (n, ...) of REACH_FIELDS of an object's grasps.
+
+    Raises:
+        DataError: If a file of the dataset is missing or damaged.
+    """
+    source, count = task.config.hand_source, len(task.trial_ids)
+    cell = make_cell(task.arm, source, mount_of(task.arm, load_hand(source)))
+    q = np.full((count, 3, len(cell.limits)), np.nan)
+    outcome, clearance = np.zeros(count, dtype=np.uint8), np.full(count, np.nan)
+    if count:
+        prepared = load_prepared(task.out, task.name, task.config)
+        q_open = open_hands(prepared, task.config, task.joints, dict(task.trials))
+
+    # One grasp after the other, each by itself.
+    X_TO, X_OG = (unpack_pose(task.trials[key]) for key in ("X_TO", "X_OG"))
+    for i in range(count):
+        grasp = Grasp(
+            X_TO=X_TO[i],
+            X_TG=multiply(X_TO[i], X_OG[i]),
+            q_open=q_open[i],
+            q_closed=task.trials["closed_q"][i],
+            p_TG_lifted=np.array(task.config.lift.p_TG),
+        )
+        found = reach_grasp(cell, prepared.model, grasp)
+        outcome[i] = REACHES.index(found.outcome)
+        q[i], clearance[i] = found.q, found.clearance
+    return {
+        "object": np.full(count, task.name, dtype=object),
+        **{key: task.trials[key] for key in ("candidate", "standoff_index")},
+        "trial_id": np.asarray(task.trial_ids),
+        "reachable": outcome == 0,
+        "reach_outcome": outcome,
+        **{name: q[:, k] for k, name in enumerate(("q_approach", "q_grasp", "q_lift"))},
+        "clearance": clearance,
+    }

@@ -1,0 +1,196 @@
+"""An arm's branches, what it collides with, and what it can do about a grasp."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.arms import write_arm
+from helpers.objects import box_model
+
+from drakegrasp.frames import Array, invert_pose, make_pose, rotation_about, rotation_angle
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.reach.arm import load_arm, mount_of
+from drakegrasp.reach.branches import find_branches, flange_poses, follow
+from drakegrasp.reach.cell import Cell, make_cell
+from drakegrasp.reach.reaching import Grasp, approach_path, lift_path, reach_grasp
+
+#: Height of the box [m].
+HEIGHT = 0.1
+BASE = (-0.5, 0.0, 0.0, 0.3)
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("box"), [0.06, 0.06, HEIGHT])
+
+
+def cell_of(path: Path, base: tuple[float, ...] = BASE, hand: str = "barrett") -> Cell:
+    arm = load_arm(path, base)
+    return make_cell(arm, hand, mount_of(arm, load_hand(hand)))
+
+
+def hand_at(cell: Cell, share: float) -> Array:
+    """Return the joints of a hand that has closed by a share of a radian."""
+    named = joint_positions(cell.hand, 0.0, np.full(cell.hand.num_fingers, share))
+    return np.array([named[name] for name in cell.hand_joints])
+
+
+def drawn(cell: Cell, count: int) -> Array:
+    """Return configurations (count, a) within the limits, and within a turn."""
+    lower, upper = np.clip(cell.limits, -3.0, 3.0).T
+    return lower + np.random.default_rng(0).random((count, len(lower))) * (upper - lower)
+
+
+def pose_by_drake(cell: Cell, q: Array, frame: str) -> Array:
+    plant, context = cell.checker.plant(), cell.checker.plant_context()
+    cell.checker.UpdatePositions(cell.positions(q, np.zeros(len(cell.hand_columns))))
+    return np.asarray(plant.GetFrameByName(frame).CalcPoseInWorld(context).GetAsMatrix4())
+
+
+def top_grasp(cell: Cell, **changes: object) -> Grasp:
+    """Return a grasp of the box from above, with the palm 80 mm above it."""
+    down = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, HEIGHT + 0.08])
+    grasp = Grasp(
+        X_TO=make_pose(np.eye(3), [0.0, 0.0, HEIGHT / 2.0]),
+        X_TG=down,
+        q_open=hand_at(cell, 0.0),
+        q_closed=hand_at(cell, 0.8),
+        p_TG_lifted=np.array([0.0, 0.0, 0.4]),
+    )
+    return replace(grasp, **changes)
+
+
+def test_branches_meet_their_pose_by_drake_within_limits(six: Path) -> None:
+    cell = cell_of(six)
+    lower, upper = cell.limits.T
+    np.testing.assert_allclose(cell.limits[[0, 5]], [[-6.2, 6.2], [-2 * np.pi, 2 * np.pi]])
+    for q in drawn(cell, 8):
+        X_TF = pose_by_drake(cell, q, "flange")
+        found = find_branches(cell.chain, cell.limits, X_TF)
+        for row in found:
+            X = invert_pose(X_TF) @ pose_by_drake(cell, row, "flange")
+            assert np.abs(X[:3, 3]).max() < 1e-4
+            assert rotation_angle(X[:3, :3]) < 1e-3
+        assert ((found >= lower) & (found <= upper)).all()
+        # The drawn configuration is among them, and no two are one.
+        turns = np.abs(np.sin((found - q) / 2.0)).max(axis=1)
+        assert (turns < 1e-3).sum() == 1
+        apart = np.abs(found[:, None] - found[None]).max(axis=2) + np.eye(len(found))
+        assert apart.min() >= 0.05
+
+
+def test_six_joints_have_eight_branches(six: Path) -> None:
+    cell = cell_of(six)
+    q = np.array([-1.4, 1.3, 0.7, 1.1, -1.2, 1.2])
+    found = find_branches(cell.chain, cell.limits, flange_poses(cell.chain, q[None])[0][0])
+    assert len(found) == 8
+    # The first one is farthest from its limits.
+    middle, half = cell.limits.mean(axis=1), np.diff(cell.limits, axis=1)[:, 0] / 2.0
+    use = np.abs((found - middle) / half).max(axis=1)
+    assert (np.diff(use) >= 0.0).all()
+    assert not len(find_branches(cell.chain, cell.limits, make_pose(np.eye(3), [9.0, 0.0, 0.0])))
+
+
+def test_the_jacobian_is_the_derivative_of_the_pose(six: Path) -> None:
+    cell, step = cell_of(six), 1e-6
+    (q,) = drawn(cell, 1)
+    X, J = flange_poses(cell.chain, q + step * np.concatenate([np.zeros((1, 6)), np.eye(6)]))
+    np.testing.assert_allclose((X[1:, :3, 3] - X[0, :3, 3]) / step, J[0, :3].T, atol=1e-5)
+    R = (X[1:, :3, :3] - X[0, :3, :3]) / step @ X[0, :3, :3].T
+    turning = np.stack([R[:, 2, 1], R[:, 0, 2], R[:, 1, 0]])
+    np.testing.assert_allclose(turning, J[0, 3:], atol=1e-5)
+
+
+def test_a_branch_is_followed_without_a_jump(six: Path) -> None:
+    cell = cell_of(six)
+    q = np.array([[0.4, 0.2, 1.6, 0.4, 1.1, 0.2]])
+    start, way = flange_poses(cell.chain, q)[0][0], np.array([-0.05, 0.05, 0.12])
+    path = np.tile(start, (12, 1, 1))
+    path[:, :3, 3] += np.linspace(1.0 / 12.0, 1.0, 12)[:, None] * way
+    found, alive = follow(cell.chain, cell.limits, path, q, 0.3)
+    assert alive.all()
+    np.testing.assert_allclose(flange_poses(cell.chain, found[:, 0])[0], path, atol=1e-4)
+    moved = np.abs(np.diff(np.concatenate([q[None], found]), axis=0)).max()
+    for jump, expected in ((1.01 * moved, True), (0.99 * moved, False)):
+        assert follow(cell.chain, cell.limits, path, q, jump)[1][0] == expected
+
+    # Limits that the branch crosses on its way, and a pose beyond the arm, end it.
+    tight = np.stack([np.minimum(q[0], found[5, 0]), np.maximum(q[0], found[5, 0])], axis=1)
+    assert not follow(cell.chain, tight, path, q, 0.3)[1][0]
+    path[-1, 0, 3] += 3.0
+    stopped, alive = follow(cell.chain, cell.limits, path, q, 0.3)
+    assert not alive[0]
+    np.testing.assert_array_equal(stopped[-1], stopped[-2])
+
+
+def test_what_collides(six: Path) -> None:
+    cell = cell_of(six)
+    closed = hand_at(cell, 0.5)
+    up, flat = np.zeros(6), np.array([0.0, np.pi / 2.0, 0.0, 0.0, 0.0, 0.0])
+    assert cell.is_free(up, closed)
+    assert cell.table_distance(up, closed) < 0.2  # the shoulder is 90 mm above the table
+    assert cell.is_free(flat, closed)
+    # The fore arm lies 0.11 m above the table; turned down by 0.4 rad it enters the table.
+    assert 0.0 < cell.table_distance(flat, closed) < 0.11
+    low = flat + 0.4 * np.eye(6)[1]
+    assert not cell.is_free(low, closed)
+    assert cell.table_distance(low, closed) < 0.0
+    # The fore arm folds into the upper arm.
+    assert not cell.is_free(up + 3.0 * np.eye(6)[2], closed)
+    # Beside the table there is nothing below.
+    assert cell_of(six, (-2.0, 0.0, 0.0, 0.0)).is_free(low, closed)
+
+
+def test_a_reachable_grasp(six: Path, box: ObjectModel) -> None:
+    cell = cell_of(six)
+    grasp = top_grasp(cell)
+    found = reach_grasp(cell, box, grasp)
+    assert found.outcome == "reachable"
+    assert 0.0 < found.clearance < 0.1
+    X_FG = cell.X_FG
+    for q, X_TG in zip(
+        found.q, (approach_path(grasp)[-1], grasp.X_TG, lift_path(grasp)[-1]), strict=True
+    ):
+        X = invert_pose(X_TG) @ pose_by_drake(cell, q, "flange") @ X_FG
+        assert np.abs(X[:3, 3]).max() < 1e-3
+        assert rotation_angle(X[:3, :3]) < np.deg2rad(0.5)
+        assert cell.is_free(q, grasp.q_open)
+    np.testing.assert_allclose(approach_path(grasp)[-1][:3, 3], [0.0, 0.0, HEIGHT + 0.18])
+    np.testing.assert_allclose(lift_path(grasp)[-1][:3, 3], grasp.p_TG_lifted)
+    again = reach_grasp(cell_of(six), box, grasp)
+    np.testing.assert_array_equal(again.q, found.q)
+
+
+def test_why_a_grasp_is_not_reachable(six: Path, box: ObjectModel) -> None:
+    near, far = cell_of(six), cell_of(six, (-1.9, 0.0, 0.0, 0.0))
+    aside = cell_of(six, (-0.1, 0.0, 0.0, 0.0))
+    from_below = make_pose(np.eye(3), [0.0, 0.0, -0.05])
+    turned = make_pose(rotation_about([0.0, 1.0, 0.0], np.pi / 2.0), [-0.10, 0.0, 0.06])
+    cases = {
+        "out_of_reach": (far, top_grasp(far)),
+        "approach": (near, top_grasp(near, X_TG=from_below)),
+        "lift": (near, top_grasp(near, p_TG_lifted=np.array([0.0, 0.0, 2.0]))),
+        "collision": (aside, top_grasp(aside, X_TG=turned, p_TG_lifted=np.array([0.0, 0.0, 0.2]))),
+    }
+    for outcome, (cell, grasp) in cases.items():
+        found = reach_grasp(cell, box, grasp)
+        assert found.outcome == outcome
+        assert np.isnan(found.q).all()
+        assert np.isnan(found.clearance)
+
+
+def test_the_hand_must_not_meet_the_object_on_its_way(six: Path, box: ObjectModel) -> None:
+    """From the side, the open hand would come through a second box; a hull knows no hole."""
+    cell = cell_of(six)
+    inside = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, HEIGHT - 0.04])
+    assert reach_grasp(cell, box, top_grasp(cell, X_TG=inside)).outcome == "approach"

@@ -1,0 +1,232 @@
+"""OUT/reach/NAME.hdf5, and arms that cannot be used."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import Mock
+
+import h5py
+import numpy as np
+import pytest
+from helpers.arms import write_arm
+from helpers.commands import error_line, run
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.check import check_dataset
+from drakegrasp.dataset.paths import reach_path
+from drakegrasp.dataset.rejections import AttemptKey
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.filters import Removal
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import MODELS, hand_names
+from drakegrasp.reach import rows
+from drakegrasp.reach.arm import ARMS, TABLE_SIZE, Arm, load_arm, mount_of, mount_pose
+from drakegrasp.reach.rows import reach_dataset
+from drakegrasp.runtime.executor import processes
+from drakegrasp.runtime.files import seal
+
+BASE = "-0.5,0,0,0"
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def arm(six: Path) -> Arm:
+    return load_arm(six, (-0.5, 0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def asked(sound: Path, arm: Arm, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with a file of the arm."""
+    out = tmp_path_factory.mktemp("asked") / "out"
+    shutil.copytree(sound, out)
+    reach_dataset(out, arm)
+    return out
+
+
+@pytest.fixture
+def out(asked: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(asked, tmp_path / "out"))
+
+
+def test_a_row_per_sample(asked: Path, arm: Arm) -> None:
+    trials = Trials(asked)
+    samples = trials[trials["removal"] == Removal.KEPT]
+    with h5py.File(reach_path(asked, "six")) as file:
+        rows = {name: file["reach"][name][:] for name in file["reach"]}
+        assert file.attrs["arm"] == "six"
+        np.testing.assert_array_equal(file.attrs["base"], arm.base)
+        assert file.attrs["mount"].shape == (12,)
+    assert rows["trial_id"].tolist() == samples.trial_ids.tolist()
+    assert [name.decode() for name in rows["object"]] == samples["object_name"].tolist()
+    assert rows["q_grasp"].shape == (len(samples), 6)
+    assert not check_dataset(asked)
+
+
+def test_the_command_on_any_number_of_workers(out: Path, six: Path) -> None:
+    first = reach_path(out, "six").read_bytes()
+    result = run("reach", out, "--arm", six, "--base", BASE, "--name", "again", "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "reachable: " in result.stdout
+    assert reach_path(out, "again").read_bytes() == first
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_two_processes_write_the_same_bytes(out: Path, arm: Arm) -> None:
+    with processes(2) as execute:
+        reach_dataset(out, arm, name="two", execute=execute)
+    assert reach_path(out, "two").read_bytes() == reach_path(out, "six").read_bytes()
+
+
+def test_a_dataset_that_grew_gets_the_missing_rows(
+    out: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = reach_dataset(out, arm)
+    reach_path(out, "six").unlink()
+    identity = (whole[name][:4].tolist() for name in ("object", "candidate", "standoff_index"))
+    rejected = [AttemptKey(*key) for key in zip(*identity, strict=True)]
+    assemble(out, rejected=rejected)
+    some = reach_dataset(out, arm)
+    assert some.count == whole.count - 4
+    assemble(out)
+    spy = Mock(side_effect=rows.reach_grasp)
+    monkeypatch.setattr(rows, "reach_grasp", spy)
+    grown = reach_dataset(out, arm)
+    assert spy.call_count == 4
+    for name in whole.names:
+        np.testing.assert_array_equal(grown[name], whole[name])
+    # Rows of grasps that are no samples any more stay.
+    assemble(out, rejected=rejected)
+    assert reach_dataset(out, arm).count == whole.count
+
+
+def test_a_file_of_another_arm_is_not_replaced(out: Path, six: Path) -> None:
+    before = reach_path(out, "six").read_bytes()
+    with pytest.raises(DataError, match="must be of the same base, got another"):
+        reach_dataset(out, load_arm(six, (-0.6, 0.0, 0.0, 0.0)))
+    assert reach_path(out, "six").read_bytes() == before
+
+
+FAULTS: dict[str, tuple[str, Callable[[h5py.File], object]]] = {
+    "reachable must be true": ("reachable", lambda values: ~values),
+    "q_lift must be finite": ("q_lift", lambda values: np.where(np.isnan(values), 0.0, np.nan)),
+    "reach_outcome must be 0..4": ("reach_outcome", lambda values: values + 5),
+    "candidate must be that of the trial": ("candidate", lambda values: values + 1),
+    "object must be that of the trial": ("object", lambda values: values[::-1]),
+    "trial_id must be one of the rows": ("trial_id", lambda values: values + 10**6),
+}
+
+
+@pytest.mark.parametrize("what", FAULTS)
+def test_check_finds_a_fault(out: Path, what: str) -> None:
+    path, (name, spoil) = reach_path(out, "six"), FAULTS[what]
+    with h5py.File(path, "r+") as file:
+        dataset = file[f"reach/{name}"]
+        dataset[...] = spoil(dataset[:])
+    seal(path)
+    (found, *_) = check_dataset(out)
+    assert found.file == "reach/six.hdf5"
+    assert found.what.startswith(what)
+
+
+def test_check_finds_a_damaged_file_and_one_of_another_state(out: Path) -> None:
+    path = reach_path(out, "six")
+    content = path.read_bytes()
+    with h5py.File(path, "r+") as file:
+        file.attrs["shards"] = "0"
+    seal(path)
+    (found,) = check_dataset(out)
+    assert str(found) == (
+        "reach/six.hdf5: attribute shards must be that of the shards that are there, got another; "
+        "run `drakegrasp reach` again"
+    )
+    middle = len(content) // 2
+    path.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+    assert "the file must be as it was written" in [found.what for found in check_dataset(out)]
+
+
+# Arms
+
+
+BAD_FILES = {
+    "joint 'elbow' must have a lower limit below its upper one, got 3.1..3.1": ("-3.1", "3.1"),
+    "joint 'pan' must be revolute, continuous, prismatic, fixed, got 'floating'": (
+        'name="pan" type="revolute"',
+        'name="pan" type="floating"',
+    ),
+    "its meshes must be there, got none at 'package://else/upper.stl'": (
+        "upper.stl",
+        "package://else/upper.stl",
+    ),
+    "must be the URDF of an arm, got XML of <sdf>": ("robot", "sdf"),
+    "must be the URDF of an arm, got mismatched tag": ("</robot>", "</rob>"),
+    "flange must be named, as the model ends at flange, spare": (
+        '<link name="flange"/>',
+        '<link name="flange"/><link name="spare"/>',
+    ),
+}
+
+
+@pytest.mark.parametrize("message", BAD_FILES)
+def test_a_file_that_is_no_arm(tmp_path: Path, message: str) -> None:
+    old, new = BAD_FILES[message]
+    path = write_arm(tmp_path)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ConfigError) as caught:
+        load_arm(path, (0.0, 0.0, 0.0, 0.0))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+BAD_OPTIONS = {
+    "arm must be panda, ur5, ur10 or a .urdf file, got 'pandas'": ("--arm", "pandas"),
+    "a joint must move the flange 'base', got none": ("--flange", "base"),
+    "flange must be a link of six.urdf, got 'tool'": ("--flange", "tool"),
+    "base must be on the table, z >= 0, or beside it, |x| or |y| >= 0.8 m, got x=0.1, y=0, "
+    "z=-0.05 inside of it": ("--base", "0.1,0,-0.05,0"),
+    "base must leave the arm clear of the table, got 'shoulder'": ("--base", "-0.81,0,-0.12,0"),
+    "--base must be 4 numbers with commas, got '1,2'": ("--base", "1,2"),
+    "--mount must be 6 numbers with commas, got 'a'": ("--mount", "a"),
+    "the name of an object must be": ("--name", "../x"),
+}
+
+
+@pytest.mark.parametrize("message", BAD_OPTIONS)
+def test_bad_options_are_one_line(asked: Path, six: Path, message: str) -> None:
+    given = ("reach", asked, "--arm", six, "--base", BASE, "--quiet", *BAD_OPTIONS[message])
+    assert message in error_line(run(*given))
+
+
+def test_mounts(six: Path) -> None:
+    arm = load_arm(six, (0.0, 0.0, 0.0, 0.0))
+    for name in hand_names():
+        X_FB = mount_of(arm, load_hand(name))
+        # The open hand is beyond the flange, and its palm link near it.
+        assert X_FB[2, 3] >= 0.0
+    X_FB = mount_pose([0.0, 0.01, 0.02], [0.0, 0.0, 90.0])
+    np.testing.assert_allclose(X_FB[:3, 0], [0.0, 1.0, 0.0], atol=1e-15)
+    stated = load_arm(six, (0.0, 0.0, 0.0, 0.0), mount=X_FB)
+    np.testing.assert_allclose(mount_of(stated, load_hand()), X_FB, atol=1e-15)
+
+
+def test_the_table_is_the_slab_that_is_seen() -> None:
+    size = " ".join(f"{length:g}" for length in TABLE_SIZE)
+    assert f'<box size="{size}"/>' in (MODELS / "table.urdf").read_text()
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_arms_of_the_package(name: str) -> None:
+    try:
+        arm = load_arm(name, (-0.5, 0.0, 0.0, 0.0))
+    except ConfigError as error:
+        assert "pip install 'drakegrasp[arms]'" in str(error)
+        pytest.skip("example-robot-data is not installed")
+    assert len(arm.joints) == (7 if name == "panda" else 6)
+    assert arm.flange in ("panda_link8", "tool0")
