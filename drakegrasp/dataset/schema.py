@@ -744,8 +744,8 @@ REACH_FIELDS: tuple[Field, ...] = (
       for name, when in (("q_approach", "at the start of the approach"),
                          ("q_grasp", "at the palm pose of the grasp"),
                          ("q_lift", "at the end of the lift"))),
-    Field("clearance", "float64", "least distance, all the way, of arm and hand from the table, and "
-          "of the arm and the open hand from the object; at most 0.2, NaN if not reachable",
+    Field("clearance", "float64", "least distance, all the way, of arm and hand from the table, "
+          "and of the arm and the open hand from the object; at most 0.2, NaN if not reachable",
           unit="m", some=True, shown=Shown("clearance of the arm", "mm")),
 )
 

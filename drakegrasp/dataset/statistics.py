@@ -14,6 +14,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.assemble import validate_assembled
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.dataset.reach import count_reach
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.trials import NONE, Trials
 from drakegrasp.errors import counted
@@ -217,8 +218,15 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
         }
         for i, name in enumerate(funnel.names)
     ]
-    return {
+    found = {
         "path": str(out),
         "objects": objects,
         "splits": [asdict(split) for split in count_splits(out)],
     }
+    # Most datasets have no files of arms.
+    if counts := count_reach(out):
+        found["reach"] = [
+            {"name": c.name, "asked": c.asked.tolist(), "reachable": c.reachable.tolist()}
+            for c in counts
+        ]
+    return found

@@ -23,6 +23,7 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
 from drakegrasp.dataset.paths import reach_path
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.reach import IDENTITY, NO_ROW, OWN_IDENTITY, rows_by_identity
 from drakegrasp.dataset.schema import REACH_FIELDS, REACHES
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
@@ -43,8 +44,6 @@ from drakegrasp.table import Table
 
 #: Columns of trials from which the rows follow.
 _FOLLOW_FROM = (*OPEN_FOLLOWS_FROM, "X_TO", "X_OG", "closed_q")
-#: Columns that identify a grasp.
-_IDENTITY = ("object", "candidate", "standoff_index")
 
 
 def reach_dataset(
@@ -87,10 +86,9 @@ def _reach(out: Path, arm: Arm, path: Path, execute: Executor, progress: Report)
     make_cell(arm, manifest.config.hand_source, X_FB)  # fails early
     attributes = _attributes(manifest, trials, arm, X_FB)
     old = _old_rows(path, attributes)
-    done = set(zip(*(old[key].tolist() for key in _IDENTITY), strict=True)) if old else set()
 
     # New rows, in the order of the objects, and old rows with the numbers of their trials now.
-    tasks = list(_tasks(out, manifest, trials, arm, done))
+    tasks = list(_tasks(out, manifest, trials, arm, old))
     parts = [old] if old is not None else []
     progress(0, len(tasks))
     for count, columns in enumerate(in_order(execute)(reach_object, tasks), start=1):
@@ -142,13 +140,14 @@ def _old_rows(path: Path, due: Mapping[str, Any]) -> Table | None:
 
 
 def _tasks(
-    out: Path, manifest: Manifest, trials: Trials, arm: Arm, done: set[Any]
+    out: Path, manifest: Manifest, trials: Trials, arm: Arm, old: Table | None
 ) -> Iterator[ReachTask]:
     """Yield a task per object, with its samples that have no row."""
-    samples = trials[trials["removal"] == Removal.KEPT]
-    columns = samples.columns(("object_name", "candidate", "standoff_index"))
-    keys = zip(*(values.tolist() for values in columns.values()), strict=True)
-    new = samples[np.array([key not in done for key in keys], dtype=np.bool_)]
+    new = trials[trials["removal"] == Removal.KEPT]
+    if old is not None:
+        columns = new.columns(IDENTITY)
+        rows = rows_by_identity([old[k] for k in OWN_IDENTITY], [*columns.values()])
+        new = new[rows == NO_ROW]
     names = new["object_name"]
     for entry in manifest.objects:
         own = new[names == entry.name]
@@ -165,13 +164,10 @@ def _tasks(
 
 def _numbered(rows: Table, trials: Trials) -> Table:
     """Return rows in the order of their trials, with the numbers that the trials have now."""
-    now = trials.columns(("object_name", "candidate", "standoff_index"))
-    keys = zip(*(values.tolist() for values in now.values()), strict=True)
-    places = {key: number for number, key in enumerate(keys)}
-    own = zip(*(rows[key].tolist() for key in _IDENTITY), strict=True)
-    ids = np.array([places.get(key, -1) for key in own], dtype=np.int64)
-    rows = rows.with_columns({"trial_id": ids})
-    return rows[np.argsort(ids, kind="stable")][(ids < 0).sum() :]
+    now = trials.columns(IDENTITY)
+    ids = rows_by_identity([*now.values()], [rows[key] for key in OWN_IDENTITY])
+    order = np.argsort(ids, kind="stable")
+    return rows.with_columns({"trial_id": ids})[order[ids[order] != NO_ROW]]
 
 
 # The grasps of one object

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from helpers.commands import error_line, run
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.paths import reach_path
+from drakegrasp.dataset.reach import count_reach
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
@@ -105,6 +107,17 @@ def test_a_dataset_that_grew_gets_the_missing_rows(
     # Rows of grasps that are no samples any more stay.
     assemble(out, rejected=rejected)
     assert reach_dataset(out, arm).count == whole.count
+
+
+def test_stats_count_by_elevation(asked: Path) -> None:
+    result = run("stats", asked)
+    reachable = int(count_reach(asked)[0].reachable.sum())
+    assert (
+        f"six reaches {reachable} of 9 samples; by elevation of the approach 0-30° 0 of 0, "
+        f"30-60° 0 of 0, 60-90° {reachable} of 9"
+    ) in result.stdout
+    (said,) = json.loads(run("stats", asked, "--json").stdout)["reach"]
+    assert said == {"name": "six", "asked": [0, 0, 9], "reachable": [0, 0, reachable]}
 
 
 def test_a_file_of_another_arm_is_not_replaced(out: Path, six: Path) -> None:
