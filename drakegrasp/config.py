@@ -402,6 +402,8 @@ class _Filters(_ExtensibleSection):
     # "lifted" switches off the rules on how well the hand holds the object: every success that the
     # filters of images and contacts keep becomes a sample.
     require: Literal["lifted", "limits"] = "limits"
+    # Name of a file of `drakegrasp reach`: grasps that its arm does not reach are no samples.
+    reachable: str | None = None
 
     if TYPE_CHECKING:
 

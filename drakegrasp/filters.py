@@ -46,6 +46,7 @@ class Removal(IntEnum):
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first filter
     OWN = 15  # a user-defined filter does not keep it; before OUTLIER
     NEAR_CONE = 16  # a fingertip uses too much of its friction cone; before OUTLIER
+    UNREACHABLE = 17  # the arm of `filters.reachable` does not reach it; before REJECTED
 
     @property
     def label(self) -> str:

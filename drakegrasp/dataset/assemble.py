@@ -54,6 +54,7 @@ from drakegrasp.dataset.paths import (
     TRIALS_FILE,
     model_path,
 )
+from drakegrasp.dataset.reach import is_reachable
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import (
     CAMERAS,
@@ -70,7 +71,7 @@ from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard
 from drakegrasp.dataset.split import find_homes, split_samples
 from drakegrasp.dataset.successes import judge_successes, shard_successes, successes_of
 from drakegrasp.errors import DataError
-from drakegrasp.filters import Removal
+from drakegrasp.filters import Flags, Removal
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.environment import available_cores
@@ -357,7 +358,8 @@ def survey(
     if rejected is not None:
         manifest = replace(manifest, rejected=find_keys(rejected, by_key, out))
     rejected_ids = [by_key[key] for key in manifest.rejected if key in by_key]
-    removal = judge_successes(successes, manifest.config.filters, rejected_ids)
+    unreachable = _unreachable(out, manifest, successes)
+    removal = judge_successes(successes, manifest.config.filters, rejected_ids, unreachable)
     manifest, samples = _split(manifest, successes[removal == Removal.KEPT])
     return Survey(
         manifest=manifest,
@@ -367,6 +369,20 @@ def survey(
         sizes=letters,
         seals=seals,
     )
+
+
+def _unreachable(out: Path, manifest: Manifest, successes: Table) -> Flags | None:
+    """Return which successes (n,) the arm of `filters.reachable` does not reach; None without it.
+
+    Raises:
+        DataError: If the arm has no file.
+    """
+    name = manifest.config.filters.reachable
+    if name is None:
+        return None
+    names = np.array([entry.name for entry in manifest.objects], dtype=object)
+    identity = successes.with_columns(object_name=names[successes["object"]])
+    return ~is_reachable(out, name, identity)[1]
 
 
 def _ids_by_key(manifest: Manifest, successes: Table) -> dict[AttemptKey, int]:

@@ -145,6 +145,7 @@ def judge_successes(
     successes: Table,
     config: FilterConfig,
     rejected: Sequence[int] = (),
+    unreachable: Flags | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Return the `Removal` (n,) of each success.
 
@@ -152,6 +153,8 @@ def judge_successes(
         successes: The n successes, with the columns of `successes_of`.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
+        unreachable: (n,), which successes the arm of `config.reachable` does not reach, or was not
+            asked for; None without such an arm.
 
     Raises:
         ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
@@ -170,7 +173,9 @@ def judge_successes(
             outside = is_outlier(successes["grasp_T"][rows], config.outlier_sigma)
             removal[rows[outside]] = Removal.OUTLIER
 
-    # The inspection comes last, since it only saw samples.
+    # An arm is asked for samples, and an inspection sees samples: they come last.
+    if unreachable is not None:
+        removal[unreachable & (removal == Removal.KEPT)] = Removal.UNREACHABLE
     is_rejected = np.isin(successes["trial_id"], np.asarray(rejected, dtype=np.int64))
     removal[is_rejected & (removal == Removal.KEPT)] = Removal.REJECTED
     return removal

@@ -143,7 +143,7 @@ def _tasks(
     out: Path, manifest: Manifest, trials: Trials, arm: Arm, old: Table | None
 ) -> Iterator[ReachTask]:
     """Yield a task per object, with its samples that have no row."""
-    new = trials[trials["removal"] == Removal.KEPT]
+    new = trials[np.isin(trials["removal"], (Removal.KEPT, Removal.UNREACHABLE))]
     if old is not None:
         columns = new.columns(IDENTITY)
         rows = rows_by_identity([old[k] for k in OWN_IDENTITY], [*columns.values()])

@@ -103,7 +103,8 @@ def test_outliers_are_judged_among_the_grasps_that_are_left() -> None:
 def test_numbers_of_removals_are_those_in_files() -> None:
     """Files of earlier builds have them: a new one comes at the end."""
     names = "kept other_links slid turned not_seen out_of_view bisects_table flat_depth "
-    names += "off_surface normal_off outlier rejected anomalous missing_finger - own near_cone"
+    names += "off_surface normal_off outlier rejected anomalous missing_finger - own near_cone "
+    names += "unreachable"
     known = [(value, name) for value, name in enumerate(names.split()) if name != "-"]
     assert [(r.value, r.label) for r in Removal] == known
 

@@ -120,6 +120,27 @@ def test_stats_count_by_elevation(asked: Path) -> None:
     assert said == {"name": "six", "asked": [0, 0, 9], "reachable": [0, 0, reachable]}
 
 
+def test_the_filter_of_reachable_grasps(out: Path, arm: Arm) -> None:
+    path, whole = reach_path(out, "six"), reach_dataset(out, arm)
+    with h5py.File(path, "r+") as file:  # as if the arm reached all but two
+        rows = file["reach"]
+        rows["reachable"][...] = np.arange(whole.count) >= 2
+        for name in ("q_approach", "q_grasp", "q_lift"):
+            rows[name][...] = np.where(np.arange(whole.count)[:, None] >= 2, 0.0, np.nan)
+        rows["clearance"][...] = np.where(np.arange(whole.count) >= 2, 0.1, np.nan)
+        rows["reach_outcome"][...] = np.arange(whole.count) < 2
+    seal(path)
+    assemble(out, overrides=["filters.reachable=six"])
+    removal = Trials(out)[whole.trial_id]["removal"]
+    assert removal[:2].tolist() == [Removal.UNREACHABLE] * 2
+    assert not removal[2:].any()
+    assert not check_dataset(out)
+    # The arm is still asked for them, and a file that is not there is named.
+    assert reach_dataset(out, arm).count == whole.count
+    with pytest.raises(DataError, match=r"seven.hdf5: must be the reach of an arm, got none"):
+        assemble(out, overrides=["filters.reachable=seven"])
+
+
 def test_a_file_of_another_arm_is_not_replaced(out: Path, six: Path) -> None:
     before = reach_path(out, "six").read_bytes()
     with pytest.raises(DataError, match="must be of the same base, got another"):
