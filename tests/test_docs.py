@@ -212,7 +212,7 @@ def test_commands_and_options_in_the_docs_exist() -> None:
     lines = [(page, *line) for page in DOCS for line in command_lines(page)]
     assert len(lines) > 20
     for page, name, options, words in lines:
-        unknown = {word for word in words if word.startswith("-")} - options
+        unknown = {word for word in words if re.match("--?[a-z]", word)} - options
         assert not unknown, f"{page_id(page)}: {name} {words}"
 
 
