@@ -79,6 +79,7 @@ PY_NOT_RUN = {
     "simulate=5, view=view": "wants a depth image; tests/scoring/test_predicting.py",
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     'dg.load_arm("ur5"': "wants the extra arms; tests/reach/test_rows.py",
+    'dg.load_arm("panda"': "wants the extra arms; tests/reach/test_verdicts.py",
     "read_closed_grasps(out)": "an exporter of the reader; tests/test_plugin.py",
     "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
     "dg.SceneDataset(": "wants scenes and torch; tests/dataset/test_scene_reader.py",

@@ -31,6 +31,7 @@ from drakegrasp.protocols.postures import (
     prepare_trials,
     verify_postures,
 )
+from drakegrasp.reach.arm import Arm
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, count_workers, processes, run_here
 from drakegrasp.runtime.progress import progress_bar
@@ -74,6 +75,7 @@ def verify_grasp(
     X_TO: npt.ArrayLike | None = None,
     hand: str | Path | None = None,
     config: Config | None = None,
+    arm: Arm | None = None,
 ) -> Verification:
     """Return whether a predicted grasp holds its object in the simulator, and the reason.
 
@@ -93,6 +95,7 @@ def verify_grasp(
         X_TO: Pose (4, 4) of an object on the table.
         hand: Name or YAML file of the hand.
         config: Hand, physics, lift and rules.
+        arm: An arm, see `load_arm`: `reach` of the verdict tells what it can do about the grasp.
 
     Returns:
         The verdict. Numbers that are not a valid grasp, e.g. NaN, have the outcome `invalid`.
@@ -121,6 +124,7 @@ def verify_grasp(
         X_TO=X_TO,
         hand=hand,
         config=config,
+        arm=arm,
     )
     return verdict
 
@@ -144,6 +148,7 @@ def verify_grasps(
     X_TO: npt.ArrayLike | None = None,
     hand: str | Path | None = None,
     config: Config | None = None,
+    arm: Arm | None = None,
     client: Client | None = None,
     show: bool = False,
 ) -> list[Verification]:
@@ -174,6 +179,7 @@ def verify_grasps(
         config: Hand, physics, lift and rules. If None, those of the placed object or of the
             dataset, or else the defaults. If it replaces a dataset's, values drawn for a row are
             not used.
+        arm: An arm, see `load_arm`. It is asked in this process, for the first wrist poses.
         client: A Dask client whose workers share the work. If None, up to four grasps are verified
             in this process, and more than four by workers on this machine.
         show: Whether to show progress on standard error.
@@ -204,7 +210,8 @@ def verify_grasps(
         target = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
         used, frame = target.config, frame or "object"
         placed = contacts_on_object(grasps, target, frame=frame, X_TC=X_TC)
-    return run_verification(placed, used, client=client, show=show, explained=False)
+    verdicts = run_verification(placed, used, client=client, show=show, explained=False)
+    return verdicts if arm is None else [verdict.reached_by(arm) for verdict in verdicts]
 
 
 def _validate_none(on: Sample | GraspDataset, **given: object) -> None:

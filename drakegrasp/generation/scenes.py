@@ -58,7 +58,13 @@ from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import atomic_path, disk_full_named, new_hdf5
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Draw, Stream, object_key
-from drakegrasp.simulation.attempt import Conditions, Source, conditions_from, usual_materials
+from drakegrasp.simulation.attempt import (
+    Attempt,
+    Conditions,
+    Source,
+    conditions_from,
+    usual_materials,
+)
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
 from drakegrasp.vision.rendering import Renderer, paint, render
@@ -473,7 +479,11 @@ def _given_start(
     identity: Mapping[str, int],
 ) -> Array:
     """Return the positions (j,) of the joints from which the hand of a posture closes."""
-    attempt = find_attempt(prepared, **identity, config=config)
+    return open_joints(find_attempt(prepared, **identity, config=config), hand, joints)
+
+
+def open_joints(attempt: Attempt, hand: Hand, joints: Sequence[str]) -> Array:
+    """Return the positions (j,) of the joints from which the hand of an attempt closes."""
     if attempt.path is not None:
         return attempt.path[0]
     shaped = hand.at(attempt.preshape)

@@ -16,13 +16,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from drakegrasp.arithmetic import norm
+from drakegrasp.config import Config
 from drakegrasp.dataset.schema import REACHES
 from drakegrasp.frames import Array, invert_pose
+from drakegrasp.generation.scenes import open_joints
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.finger_sweep import link_points
 from drakegrasp.hand.kinematics import posed_links
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.reach.arm import Arm, mount_of
 from drakegrasp.reach.branches import find_branches, follow
-from drakegrasp.reach.cell import FIRST, NEAR, Cell
+from drakegrasp.reach.cell import FIRST, NEAR, Cell, make_cell
+from drakegrasp.runtime.environment import one_thread
+from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.simulation.screen import COVERED, PointLookup
 
 #: Length of the straight approach [m].
@@ -127,6 +134,44 @@ def reach_grasp(cell: Cell, model: ObjectModel, grasp: Grasp) -> Reach:
                 clearance=min(room, *(_clearance(cell, model, *state) for state in way)),
             )
     return _unreachable(cell, farthest)
+
+
+@one_thread
+def reach_attempt(
+    arm: Arm,
+    model: ObjectModel,
+    attempt: Attempt,
+    X_TO: Array,
+    config: Config,
+    *,
+    q_closed: Array | None = None,
+) -> Reach:
+    """Return what an arm can do about an attempt, wherever its object is on the table.
+
+    Args:
+        arm: The arm.
+        model: The object.
+        attempt: Palm pose, and the open hand.
+        X_TO: Pose (4, 4) of the object. The lift goes as in the simulation, where the object is in
+            the middle of the table without yaw.
+        config: Hand and lift.
+        q_closed: (j,), joints of the closed hand [rad or m]; None for those of the open hand.
+
+    Raises:
+        ConfigError: If the arm does not carry the hand.
+    """
+    hand = load_hand(config.hand_source)
+    cell = make_cell(arm, config.hand_source, mount_of(arm, hand))
+    q_open = open_joints(attempt, hand, cell.hand_joints)
+    moved = X_TO @ invert_pose(canonical_pose(X_TO))
+    grasp = Grasp(
+        X_TO=X_TO,
+        X_TG=X_TO @ attempt.X_OG,
+        q_open=q_open,
+        q_closed=q_open if q_closed is None else q_closed,
+        p_TG_lifted=moved[:3, :3] @ config.lift.p_TG + moved[:3, 3],
+    )
+    return reach_grasp(cell, model, grasp)
 
 
 def approach_path(grasp: Grasp, step: float = STEP) -> Array:

@@ -29,6 +29,8 @@ from drakegrasp.frames import Array, pack_pose
 from drakegrasp.generation.attempts import unjudged
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
+from drakegrasp.reach.arm import Arm
+from drakegrasp.reach.reaching import Reach, reach_attempt
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.simulation.attempt import Attempt
@@ -93,6 +95,7 @@ class Verification:
             tried.
         margin: Epsilon, if it was computed already.
         told: The hints, if they were found already.
+        reach: What an arm can do about the first wrist pose; None if no arm was asked.
     """
 
     grasp: PlacedGrasp
@@ -106,6 +109,7 @@ class Verification:
     stand: int = 0
     margin: float | None = None
     told: tuple[str, ...] | None = None
+    reach: Reach | None = None
 
     @property
     def placed(self) -> PlacedObject:
@@ -260,6 +264,19 @@ class Verification:
         """Return the verdict with margins and hints, which are computed now."""
         return replace(self, margin=self.epsilon, told=self.hints)
 
+    def reached_by(self, arm: Arm) -> Verification:
+        """Return the verdict with what an arm can do about the first wrist pose, if there is one.
+
+        Raises:
+            ConfigError: If the arm does not carry the hand.
+        """
+        if self.first is None:
+            return self
+        closed, about = self.first.trial.closed, (self.placed.model, self.first.pregrasp)
+        q_closed = None if closed is None else closed.q
+        reach = reach_attempt(arm, *about, self.placed.X_TO, self.config, q_closed=q_closed)
+        return replace(self, reach=reach)
+
     def findings(self) -> dict[str, Any]:
         """Return the attributes without the grasp, whose meshes are large."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "grasp"}
@@ -336,9 +353,24 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _as_a_sample(verified, verified.removal)
         yield from _loads(verified)
 
+    if verified.reach is not None:
+        yield _by_the_arm(verified.reach)
+
     # Other possible faults in the numbers.
     if verified.hints:
         yield better
+
+
+def _by_the_arm(reach: Reach) -> str:
+    if reach.reachable:
+        return f"The arm reaches it, with a clearance of {in_mm(reach.clearance)}."
+    why = {
+        "out_of_reach": "the palm pose is out of its reach",
+        "collision": "arm or hand collides at the palm pose",
+        "approach": "it cannot come straight to the palm pose",
+        "lift": "it cannot lift straight from there",
+    }
+    return f"The arm does not reach it: {why[reach.outcome]}."
 
 
 def _misplaced(verified: Verification) -> str:
