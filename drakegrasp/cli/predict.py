@@ -13,11 +13,13 @@ from cyclopts.validators import Number
 import drakegrasp as dg
 from drakegrasp.cli.arguments import AnyPath, Count, File, Positive, Settings, Split, Units
 from drakegrasp.cli.console import UsageError, processes, say, wrong_input
+from drakegrasp.cli.reach import ArmOptions
 from drakegrasp.errors import GraspError, MeshError
 
 if TYPE_CHECKING:
     from drakegrasp.arithmetic import Array
     from drakegrasp.hand.description import Hand
+    from drakegrasp.reach.arm import Arm
     from drakegrasp.simulation.attempts import GraspTable
     from drakegrasp.vision.depth_image import View
 
@@ -26,8 +28,8 @@ HDF5 = (".h5", ".hdf5")
 #: Kinds of INPUT, and the options that each has.
 KINDS = {
     "scenes": ("split", "workers"),
-    "a cloud": ("units",),
-    "a depth image": ("camera", "mask", "camera_pose", "depth_scale"),
+    "a cloud": ("units", "arm"),
+    "a depth image": ("camera", "mask", "camera_pose", "depth_scale", "arm"),
 }
 #: Number of grasps for one object that lifts try if it is not given; scenes have many views.
 SIMULATED = 5
@@ -65,6 +67,7 @@ def predict(
     split: Split | None = None,
     units: Units | None = None,
     image: DepthImage = DepthImage(),
+    robot: ArmOptions = ArmOptions(),
     workers: Count | None = None,
     quiet: bool = False,
 ) -> None:
@@ -101,12 +104,15 @@ def predict(
     # All input is checked before anything is predicted.
     _validate_place(out, source)
     kind = _kind_of(source, image.camera)
-    _validate_options(kind, {"split": split, "units": units, "workers": workers, **vars(image)})
+    options = {"split": split, "units": units, "workers": workers, "arm": robot.arm}
+    _validate_options(kind, options | vars(image))
     how: dict[str, Any] = {"overrides": overrides, "count": count, "show": not quiet}
+    arm = robot.asked()
     if kind == "scenes":
         found, hand = _of_scenes(source, split or "test", simulate or 0, workers, **how)
     else:
         tries = SIMULATED if simulate is None else simulate
+        how["arm"] = arm
         if kind == "a cloud":
             found, hand = _of_object(_read_cloud(source, units or "m"), None, tries, **how)
         else:
@@ -197,6 +203,7 @@ def _of_object(
     overrides: tuple[str, ...],
     count: int | None,
     show: bool,
+    arm: Arm | None,
 ) -> tuple[GraspTable, Hand]:
     """Return the grasps for an object and their hand; print what to expect of them.
 
@@ -209,7 +216,7 @@ def _of_object(
     from drakegrasp.scoring.predicting import predict as predict_grasps
 
     config = dg.load_config("fast", list(overrides))
-    found, ranking = predict_grasps(cloud, view, config, simulate=simulate, count=count)
+    found, ranking = predict_grasps(cloud, view, config, simulate=simulate, count=count, arm=arm)
     if view is not None:
         X_TC = np.asarray(view.X_TC)
         X_CG = multiply(invert_pose(X_TC), found.X_FG)
@@ -217,6 +224,9 @@ def _of_object(
         found = replace(found, X_FG=X_CG, frame="camera", X_TC=X_TC)
     if show:
         say(ranking.explain(), err=True)
+        if arm is not None and (first := ranking.reach[ranking.order[0]]) and first.reachable:
+            joints = zip(arm.joints, first.q[1].tolist(), strict=True)
+            say("joints at the first grasp: " + ", ".join(f"{n} {q:.4f}" for n, q in joints))
     return found, dg.load_hand(config.hand_source)
 
 

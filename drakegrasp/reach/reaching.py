@@ -23,7 +23,7 @@ from drakegrasp.generation.scenes import open_joints
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.finger_sweep import link_points
 from drakegrasp.hand.kinematics import posed_links
-from drakegrasp.objects.model import ObjectModel
+from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.reach.arm import Arm, mount_of
 from drakegrasp.reach.branches import find_branches, follow
 from drakegrasp.reach.cell import FIRST, NEAR, Cell, make_cell
@@ -83,16 +83,16 @@ class Reach:
         return self.outcome == REACHES[0]
 
 
-def reach_grasp(cell: Cell, model: ObjectModel, grasp: Grasp) -> Reach:
+def reach_grasp(cell: Cell, field: DistanceField, grasp: Grasp) -> Reach:
     """Return what an arm can do about a grasp.
 
     Args:
         cell: The arm and its hand.
-        model: The object.
+        field: Distances from the object in {O}.
         grasp: The grasp.
     """
-    room = _room_of_hand(cell, model, grasp)
-    if room < -HAND_MARGIN - max(0.0, model.field.blur - COVERED):
+    room = _room_of_hand(cell, field, grasp)
+    if room < -HAND_MARGIN - max(0.0, field.blur - COVERED):
         return _unreachable(cell, "approach")
 
     # All branches of the grasp itself, and those that collide with nothing.
@@ -103,8 +103,8 @@ def reach_grasp(cell: Cell, model: ObjectModel, grasp: Grasp) -> Reach:
     free = [
         q
         for q in branches
-        if _is_free(cell, model, q, grasp.q_open, grasp.X_TO)
-        and _is_free(cell, model, q, grasp.q_closed, grasp.X_TO)
+        if _is_free(cell, field, q, grasp.q_open, grasp.X_TO)
+        and _is_free(cell, field, q, grasp.q_closed, grasp.X_TO)
     ]
     if not free:
         return _unreachable(cell, "collision")
@@ -117,12 +117,12 @@ def reach_grasp(cell: Cell, model: ObjectModel, grasp: Grasp) -> Reach:
     carried = up @ invert_pose(grasp.X_TG) @ grasp.X_TO
     for i, q in enumerate(free):
         if not approaches[i] or not all(
-            _is_free(cell, model, row, grasp.q_open, grasp.X_TO) for row in approach[:, i]
+            _is_free(cell, field, row, grasp.q_open, grasp.X_TO) for row in approach[:, i]
         ):
             continue
         farthest = "lift"
         if lifts[i] and all(
-            _is_free(cell, model, row, grasp.q_closed, X_TO)
+            _is_free(cell, field, row, grasp.q_closed, X_TO)
             for row, X_TO in zip(lift[:, i], carried, strict=True)
         ):
             way = [(row, grasp.q_open, grasp.X_TO) for row in (*approach[:, i], q)]
@@ -131,7 +131,7 @@ def reach_grasp(cell: Cell, model: ObjectModel, grasp: Grasp) -> Reach:
             return Reach(
                 outcome=REACHES[0],
                 q=np.stack([approach[-1, i], q, lift[-1, i]]),
-                clearance=min(room, *(_clearance(cell, model, *state) for state in way)),
+                clearance=min(room, *(_clearance(cell, field, *state) for state in way)),
             )
     return _unreachable(cell, farthest)
 
@@ -139,23 +139,25 @@ def reach_grasp(cell: Cell, model: ObjectModel, grasp: Grasp) -> Reach:
 @one_thread
 def reach_attempt(
     arm: Arm,
-    model: ObjectModel,
+    field: DistanceField,
     attempt: Attempt,
     X_TO: Array,
     config: Config,
     *,
     q_closed: Array | None = None,
+    X_TO_simulated: Array | None = None,
 ) -> Reach:
     """Return what an arm can do about an attempt, wherever its object is on the table.
 
     Args:
         arm: The arm.
-        model: The object.
+        field: Distances from the object in {O}.
         attempt: Palm pose, and the open hand.
-        X_TO: Pose (4, 4) of the object. The lift goes as in the simulation, where the object is in
-            the middle of the table without yaw.
+        X_TO: Pose (4, 4) of the object.
         config: Hand and lift.
         q_closed: (j,), joints of the closed hand [rad or m]; None for those of the open hand.
+        X_TO_simulated: Pose (4, 4) of the object in a simulation, relative to which the lift goes;
+            None for the middle of the table, without yaw.
 
     Raises:
         ConfigError: If the arm does not carry the hand.
@@ -163,7 +165,8 @@ def reach_attempt(
     hand = load_hand(config.hand_source)
     cell = make_cell(arm, config.hand_source, mount_of(arm, hand))
     q_open = open_joints(attempt, hand, cell.hand_joints)
-    moved = X_TO @ invert_pose(canonical_pose(X_TO))
+    middle = canonical_pose(X_TO) if X_TO_simulated is None else X_TO_simulated
+    moved = X_TO @ invert_pose(middle)
     grasp = Grasp(
         X_TO=X_TO,
         X_TG=X_TO @ attempt.X_OG,
@@ -171,7 +174,7 @@ def reach_attempt(
         q_closed=q_open if q_closed is None else q_closed,
         p_TG_lifted=moved[:3, :3] @ config.lift.p_TG + moved[:3, 3],
     )
-    return reach_grasp(cell, model, grasp)
+    return reach_grasp(cell, field, grasp)
 
 
 def approach_path(grasp: Grasp, step: float = STEP) -> Array:
@@ -191,7 +194,7 @@ def lift_path(grasp: Grasp) -> Array:
     return path
 
 
-def _room_of_hand(cell: Cell, model: ObjectModel, grasp: Grasp) -> float:
+def _room_of_hand(cell: Cell, field: DistanceField, grasp: Grasp) -> float:
     """Return the least distance [m] of the open hand from object and table on its approach."""
     names = cell.hand_joints
     positions = {n: np.asarray(q) for n, q in zip(names, grasp.q_open.tolist(), strict=True)}
@@ -204,25 +207,25 @@ def _room_of_hand(cell: Cell, model: ObjectModel, grasp: Grasp) -> float:
     ).astype(np.float32)
     X_TG = approach_path(grasp, HAND_STEP)
     X_TO = np.broadcast_to(grasp.X_TO, X_TG.shape)
-    lookup = PointLookup(model.field, X_TO, invert_pose(grasp.X_TO) @ X_TG)
+    lookup = PointLookup(field, X_TO, invert_pose(grasp.X_TO) @ X_TG)
     rows = np.arange(len(lookup))
     to_object = lookup.distances(rows, p_GQ, NEAR)
     return float(min(to_object.min(), lookup.heights(rows, p_GQ).min()))
 
 
-def _is_free(cell: Cell, model: ObjectModel, q: Array, q_hand: Array, X_TO: Array) -> bool:
-    return cell.is_free(q, q_hand) and _from_object(cell, model, q, q_hand, X_TO) > 0.0
+def _is_free(cell: Cell, field: DistanceField, q: Array, q_hand: Array, X_TO: Array) -> bool:
+    return cell.is_free(q, q_hand) and _from_object(cell, field, q, q_hand, X_TO) > 0.0
 
 
-def _from_object(cell: Cell, model: ObjectModel, q: Array, q_hand: Array, X_TO: Array) -> float:
+def _from_object(cell: Cell, field: DistanceField, q: Array, q_hand: Array, X_TO: Array) -> float:
     """Return the distance [m] of the arm, without the hand, from the object."""
-    lookup = PointLookup(model.field, X_TO[None], invert_pose(X_TO)[None])
+    lookup = PointLookup(field, X_TO[None], invert_pose(X_TO)[None])
     points = cell.arm_points(q, q_hand).astype(np.float32)
     return float(lookup.distances(FIRST, points, NEAR).min())
 
 
-def _clearance(cell: Cell, model: ObjectModel, q: Array, q_hand: Array, X_TO: Array) -> float:
-    return min(cell.table_distance(q, q_hand), _from_object(cell, model, q, q_hand, X_TO))
+def _clearance(cell: Cell, field: DistanceField, q: Array, q_hand: Array, X_TO: Array) -> float:
+    return min(cell.table_distance(q, q_hand), _from_object(cell, field, q, q_hand, X_TO))
 
 
 def _unreachable(cell: Cell, outcome: str) -> Reach:

@@ -221,7 +221,7 @@ def reach_object(task: ReachTask) -> dict[str, AnyArray]:
             q_closed=task.trials["closed_q"][i],
             p_TG_lifted=np.array(task.config.lift.p_TG),
         )
-        found = reach_grasp(cell, prepared.model, grasp)
+        found = reach_grasp(cell, prepared.model.field, grasp)
         outcome[i] = REACHES.index(found.outcome)
         q[i], clearance[i] = found.q, found.clearance
     return {

@@ -28,6 +28,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import override_config
 from drakegrasp.mesh.cloud import hull_solid, read_cloud
+from drakegrasp.reach.arm import Arm
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.scoring.ranking import Ranking, chosen_hand, rank
@@ -101,6 +102,7 @@ def predict(
     simulate: int,
     count: int | None = None,
     name: str = "seen",
+    arm: Arm | None = None,
 ) -> tuple[GraspTable, Ranking]:
     """Return grasps for what a camera saw of an object, the best first, and their ranking.
 
@@ -111,20 +113,22 @@ def predict(
         simulate: See `rank`.
         count: Maximum number of grasps; None for all that were proposed.
         name: Name of the object in the table.
+        arm: See `rank`.
 
     Returns:
-        Postures in the frame "table", whose `confidence` is the chance of a sample; and the ranking
-        of all proposals.
+        Postures in the frame "table", whose `confidence` is the chance of a sample, or 0 for what
+        the arm does not reach; and the ranking of all proposals.
 
     Raises:
         GraspError, HandError, MeshError: See `propose` and `rank`.
     """
     hand = load_hand(config.hand_source)
     proposals = propose(cloud, hand, name=name)
-    ranking = rank(proposals, cloud, hand, simulate=simulate, view=view, config=config)
+    ranking = rank(proposals, cloud, hand, simulate=simulate, view=view, config=config, arm=arm)
     order = ranking.order[:count]
+    chance = ranking.chance if arm is None else np.where(ranking.reachable, ranking.chance, 0.0)
     chosen = proposals.at(order.tolist())
-    return replace(chosen, confidence=ranking.chance[order], row=np.arange(len(order))), ranking
+    return replace(chosen, confidence=chance[order], row=np.arange(len(order))), ranking
 
 
 def predict_scenes(

@@ -32,6 +32,8 @@ from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
 from drakegrasp.objects.model import object_of
+from drakegrasp.reach.arm import Arm
+from drakegrasp.reach.reaching import Reach, reach_attempt
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt, usual_conditions
 from drakegrasp.simulation.attempts import GraspTable
@@ -68,7 +70,7 @@ class Ranking:
         score: (n,), 0 to 1, by closing, greater is better, an order only; -1 for a row that is not
             a posture.
         order: (n,), indices of the proposals, the largest chance first; of equal ones the earlier
-            is first.
+            is first. Those that an arm does not reach are last.
         features: Columns, each a mean over solids and moves; NaN for a row that is not a posture:
             `clearance` (n,), distance of the open hand from the object [m], negative inside, at
             most 20 mm;
@@ -89,6 +91,8 @@ class Ranking:
         height: Height of the highest point above the table [m].
         completion: On what lifts were tried: "view", solids from which the free space of a view is
             cut, "cloud", solids without a view, or empty if no lift was tried.
+        reach: (n,), what an arm can do about each proposal, None for a row that is not a posture;
+            empty if no arm was asked.
     """
 
     score: Array
@@ -98,14 +102,25 @@ class Ranking:
     share: Array
     height: float
     completion: str = ""
+    reach: tuple[Reach | None, ...] = ()
+
+    @property
+    def reachable(self) -> npt.NDArray[np.bool_]:
+        """(n,), whether the arm reaches each proposal; empty if no arm was asked."""
+        found = [each is not None and each.reachable for each in self.reach]
+        return np.array(found, dtype=np.bool_)
 
     @property
     def likely(self) -> bool:
-        """Whether the first grasp of the order is likely to be a sample."""
-        return bool(self.chance[self.order[0]] >= LIKELY)
+        """Whether the first grasp is likely to be a sample, and within reach of the arm if any."""
+        first = self.order[0]
+        reached = not self.reach or self.reachable[first]
+        return bool(reached and self.chance[first] >= LIKELY)
 
     def explain(self) -> str:
         """Return in a sentence what to expect of the first grasp."""
+        if self.reach and not self.reachable.any():
+            return f"no grasp is within reach of the arm, of {len(self.reach)}"
         tried = int(np.isfinite(self.share).sum())
         where = f"on the object completed from the {self.completion}"
         how = f"{tried} tried {where}" if tried else "no lift was tried"
@@ -125,6 +140,7 @@ def rank(
     simulate: int = 0,
     view: View | Sequence[npt.ArrayLike] | None = None,
     config: Config | None = None,
+    arm: Arm | None = None,
 ) -> Ranking:
     """Return the order in which to try proposals, by closing the hand on what a camera saw.
 
@@ -144,6 +160,8 @@ def rank(
             (4, 4) of the cloud, as in `cloud_from_depth`. They show what beside the object is
             free.
         config: Mass of the object, friction and all rules of the lifts; None for the preset `fast`.
+        arm: An arm, see `load_arm`. It is asked for all proposals, with the convex hull of the
+            points as the object, which takes about 0.1 s each.
 
     Raises:
         GraspError: If the cloud, the poses, the spread or the view are invalid, postures are in {O}
@@ -178,14 +196,40 @@ def rank(
         share[tried] = lift_shares(completed, [starts[i] for i in tried])
         completion = "cloud" if view is None else "view"
     chance = np.where(known, chances(score, share), 0.0)
+
+    # What the arm does not reach comes last.
+    reach, behind = tuple[Reach | None, ...](), np.zeros(len(score), dtype=np.bool_)
+    if arm is not None:
+        rules = lifting_config(hand, config)
+        found = {i: _reach(arm, s, solids[0], proposals, i, rules) for i, s in starts.items()}
+        reach = tuple(found.get(i) for i in range(len(score)))
+        behind = ~np.array([each is not None and each.reachable for each in reach])
     return Ranking(
         score=score,
-        order=np.argsort(-chance, kind="stable"),
+        order=np.lexsort((-chance, behind)),
+        reach=reach,
         features=Table(columns),
         chance=chance,
         share=share,
         height=float(points[:, 2].max()),
         completion=completion,
+    )
+
+
+def _reach(
+    arm: Arm, start: Attempt, solid: Solid, proposals: GraspTable | Array, i: int, config: Config
+) -> Reach:
+    """Return what an arm can do about proposal i, on the solid in {T}."""
+    q = proposals.q_grasp[i] if isinstance(proposals, GraspTable) else np.array([np.nan])
+    middle = make_pose(np.eye(3), [-solid.middle[0], -solid.middle[1], 0.0])
+    return reach_attempt(
+        arm,
+        solid.field,
+        start,
+        np.eye(4),
+        config,
+        q_closed=None if np.isnan(q).any() else q,
+        X_TO_simulated=middle,
     )
 
 

@@ -272,7 +272,7 @@ class Verification:
         """
         if self.first is None:
             return self
-        closed, about = self.first.trial.closed, (self.placed.model, self.first.pregrasp)
+        closed, about = self.first.trial.closed, (self.placed.model.field, self.first.pregrasp)
         q_closed = None if closed is None else closed.q
         reach = reach_attempt(arm, *about, self.placed.X_TO, self.config, q_closed=q_closed)
         return replace(self, reach=reach)

@@ -154,7 +154,7 @@ def test_what_collides(six: Path) -> None:
 def test_a_reachable_grasp(six: Path, box: ObjectModel) -> None:
     cell = cell_of(six)
     grasp = top_grasp(cell)
-    found = reach_grasp(cell, box, grasp)
+    found = reach_grasp(cell, box.field, grasp)
     assert found.outcome == "reachable"
     assert 0.0 < found.clearance < 0.1
     X_FG = cell.X_FG
@@ -167,7 +167,7 @@ def test_a_reachable_grasp(six: Path, box: ObjectModel) -> None:
         assert cell.is_free(q, grasp.q_open)
     np.testing.assert_allclose(approach_path(grasp)[-1][:3, 3], [0.0, 0.0, HEIGHT + 0.18])
     np.testing.assert_allclose(lift_path(grasp)[-1][:3, 3], grasp.p_TG_lifted)
-    again = reach_grasp(cell_of(six), box, grasp)
+    again = reach_grasp(cell_of(six), box.field, grasp)
     np.testing.assert_array_equal(again.q, found.q)
 
 
@@ -183,7 +183,7 @@ def test_why_a_grasp_is_not_reachable(six: Path, box: ObjectModel) -> None:
         "collision": (aside, top_grasp(aside, X_TG=turned, p_TG_lifted=np.array([0.0, 0.0, 0.2]))),
     }
     for outcome, (cell, grasp) in cases.items():
-        found = reach_grasp(cell, box, grasp)
+        found = reach_grasp(cell, box.field, grasp)
         assert found.outcome == outcome
         assert np.isnan(found.q).all()
         assert np.isnan(found.clearance)
@@ -193,4 +193,4 @@ def test_the_hand_must_not_meet_the_object_on_its_way(six: Path, box: ObjectMode
     """From the side, the open hand would come through a second box; a hull knows no hole."""
     cell = cell_of(six)
     inside = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, HEIGHT - 0.04])
-    assert reach_grasp(cell, box, top_grasp(cell, X_TG=inside)).outcome == "approach"
+    assert reach_grasp(cell, box.field, top_grasp(cell, X_TG=inside)).outcome == "approach"

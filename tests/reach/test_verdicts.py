@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.arms import write_arm
+from helpers.commands import error_line, run
 
 import drakegrasp as dg
+from drakegrasp.exchange.attempts import read_attempts
 
 GRASP = [-0.025, 0.03, -0.009, 0.025, 0.03, -0.009, 0, -0.03, -0.009, 0, 1, 0, 0, 1, 0, 0, -1, 0]
 
@@ -40,3 +42,44 @@ def test_a_verdict_tells_whether_the_arm_reaches_the_grasp(six: Path) -> None:
     assert moved.reach.reachable
     assert moved.held == verdict.held
     assert dg.verify_grasp(np.full(18, np.nan), box, arm=near).reach is None
+
+
+@pytest.fixture(scope="module")
+def cloud() -> np.ndarray:
+    box = trimesh.creation.box([0.12, 0.05, 0.08])
+    points = trimesh.sample.sample_surface(box, 1000, seed=0)[0] + np.array([0.0, 0.0, 0.04])
+    return np.asarray(points[points @ [1, 1, 1] > 0.06])
+
+
+def test_what_an_arm_does_not_reach_is_last(six: Path, cloud: np.ndarray) -> None:
+    grasps = dg.propose(cloud)
+    grasps = grasps.at(list(range(0, len(grasps), 4)))
+    plain = dg.rank(grasps, cloud)
+    assert plain.reach == ()
+    ranking = dg.rank(grasps, cloud, arm=dg.load_arm(six, (-0.35, 0.0, 0.0, 0.0)))
+    reachable = ranking.reachable[ranking.order]
+    assert reachable[0]
+    assert not reachable[-1]
+    assert (np.diff(reachable.astype(int)) <= 0).all()
+    for group in (ranking.order[reachable], ranking.order[~reachable]):
+        assert (np.diff(ranking.chance[group]) <= 0.0).all()
+    np.testing.assert_array_equal(ranking.chance, plain.chance)
+
+    none = dg.rank(grasps, cloud, arm=dg.load_arm(six, (-3.0, 0.0, 0.0, 0.0)))
+    assert not none.likely
+    assert none.explain() == f"no grasp is within reach of the arm, of {len(grasps)}"
+
+
+def test_predict_names_the_joints_of_the_first_grasp(
+    six: Path, cloud: np.ndarray, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "cloud.npy", cloud)
+    given = ("predict", tmp_path / "cloud.npy", "--out", tmp_path / "out.h5", "--simulate", 0)
+    result = run(*given, "--arm", six, "--base", "-0.35,0,0,0")
+    assert result.exit_code == 0, result.output
+    assert "joints at the first grasp: pan " in result.stdout
+    confidence = np.array(read_attempts(tmp_path / "out.h5", dg.load_hand()).confidence)
+    assert confidence[0] > 0.0
+    assert confidence[-1] == 0.0
+    assert "--base must be given with --arm" in error_line(run(*given, "--arm", six))
+    assert "--arm must be given with --base" in error_line(run(*given, "--base", "0,0,0,0"))
