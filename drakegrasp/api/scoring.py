@@ -18,6 +18,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.protocols.postures import describe, versions
 from drakegrasp.protocols.protocol import Lift, Protocol, find_protocol
+from drakegrasp.reach.arm import Arm
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Methods, Score
@@ -25,6 +26,7 @@ from drakegrasp.scoring.run import score as score_predictions
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, ranked_sets, verdict_of
 from drakegrasp.simulation.attempts import GraspRows
 from drakegrasp.verification.placing import dataset_config, overridden_keys, place_on_rows
+from drakegrasp.verification.result import Verification
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -48,6 +50,7 @@ def score(
     per_object: int | None = None,
     overrides: Sequence[str] = (),
     protocol: str = "lift",
+    arm: Arm | None = None,
     out: str | Path | None = None,
     again: str = "drakegrasp.score",
     client: Client | None = None,
@@ -74,6 +77,7 @@ def score(
             headline is about the first wrist pose.
         protocol: The rule of a verdict, by name or as `FILE.py:NAME`. All protocols but "lift" try
             the first wrist pose of a prediction in MuJoCo, on this machine.
+        arm: An arm, see `load_arm`: the card counts what it reaches apart; only with "lift".
         out: Folder that stores verdicts, so that the same call can continue, and the card.
         again: Text of the card on how to create the card again.
         client: A Dask client whose workers do the work, e.g. from `connect`.
@@ -95,9 +99,13 @@ def score(
     config = dataset_config(dataset, overrides=overrides)
     rule, stored = find_protocol(protocol)
     in_mujoco = not isinstance(rule, Lift)
+    if in_mujoco and arm is not None:
+        raise ConfigError(f"arm must be None with protocol {stored}, got {arm.name}")
     if in_mujoco and (client or workers.get("scheduler") or workers.get("scheduler_file")):
         raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
     settings = _settings(config, overrides, rule, stored)
+    if arm is not None:
+        settings["arm"] = arm.described()
     name, ranked = ranked_sets(
         predictions, dataset, rows=rows, confidence=confidence, read_as=read_as
     )
@@ -125,7 +133,7 @@ def score(
             placed,
             config,
             client=client,
-            on_result=lambda index, result: deliver(index, verdict_of(result)),
+            on_result=lambda index, result: deliver(index, verdict_of(_asked(result, arm))),
             show=show,
             explained=False,
             **workers,
@@ -147,6 +155,10 @@ def score(
     if out is not None:
         scored.save(Path(out))
     return scored
+
+
+def _asked(result: Verification, arm: Arm | None) -> Verification:
+    return result if arm is None else result.reached_by(arm)
 
 
 def _method(

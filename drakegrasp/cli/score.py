@@ -23,6 +23,7 @@ from drakegrasp.cli.arguments import (
     given,
 )
 from drakegrasp.cli.console import MORE, same_command, say, say_json, wrong_input
+from drakegrasp.cli.reach import ArmOptions
 
 #: Options that change no verdict: flags, and options with a value.
 IDLE = (
@@ -48,6 +49,7 @@ def score(
     frame: Annotated[RowFrame | None, Parameter(group=MORE)] = None,
     postures: Postures = Postures(),
     protocol: Annotated[str, Parameter(group=MORE, metavar="NAME|FILE.py:NAME")] = "lift",
+    robot: ArmOptions = ArmOptions(),
     workers: Workers = Workers(),
 ) -> None:
     """Score predicted grasps against reference rows.
@@ -85,7 +87,7 @@ def score(
     from drakegrasp.exchange.attempts import holds_postures
     from drakegrasp.scoring.references import REFERENCES
 
-    on = workers.asked()
+    on, arm = workers.asked(), robot.asked()
     with wrong_input():
         read_manifest(dataset.parent)
         bare = not references and bool(predictions) and all(map(holds_postures, predictions))
@@ -105,6 +107,7 @@ def score(
         overrides=overrides,
         read_as=given(frame=frame) | postures.asked(),
         protocol=protocol,
+        arm=arm,
         out=out,
         again=same_command(*IDLE),
         **on,

@@ -72,6 +72,11 @@ class Arm:
     base: tuple[float, float, float, float]
     mount: tuple[float, ...] | None = None
 
+    def described(self) -> dict[str, Any]:
+        """Return what decides an answer, as JSON types."""
+        about = ("name", "digest", "flange", "base", "mount")
+        return {key: getattr(self, key) for key in about}
+
     @property
     def X_TA(self) -> Array:
         """Pose (4, 4) of the first link in {T}."""

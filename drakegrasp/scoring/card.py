@@ -7,7 +7,7 @@ Markdown. The card has no times and no number of workers, so equal verdicts give
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from drakegrasp.frames import Array
 from drakegrasp.scoring.measures import (
     CURVE_MM,
     LEVEL,
+    OF_ARM,
     RESAMPLES,
     Estimate,
     Grouping,
@@ -54,6 +55,8 @@ MEANINGS = {
     "precision": "lifted by the fingertips alone",
     "stable": "a precision grasp that moves less than 5 mm and 5 degrees",
     "lifted_any": "any of at most five wrist poses holds: an oracle chose among them",
+    "reachable": "an arm reaches the first wrist pose, whether it holds or not",
+    "reached": "as the headline, and the arm reaches it",
     "objects": "objects with a row that counts in the headline",
 }
 
@@ -86,10 +89,11 @@ def card_of(
     # Draw objects or classes, and describe each set; all sets share the draws.
     clusters = grouping.classes if new_classes else grouping.names
     draws, oracle = resample(clusters), config.verify.max_tries > 1
-    described = {each.name: _set_of(each, grouping, draws, oracle) for each in sets}
+    left_out = {*(() if oracle else ("lifted_any",)), *(() if "arm" in settings else OF_ARM)}
+    measures = {name: words for name, words in MEANINGS.items() if name not in left_out}
+    described = {each.name: _set_of(each, grouping, draws, measures) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
     by_protocol = "protocol" in settings
-    measures = {k: v for k, v in MEANINGS.items() if k != "lifted_any" or oracle}
 
     card: dict[str, Any] = {
         "form": FORM,
@@ -142,7 +146,7 @@ def _set_of(
     judged: Judged,
     grouping: Grouping,
     draws: Array,
-    oracle: bool,
+    measures: Collection[str],
 ) -> dict[str, Any]:
     """Return the description of a set on the card."""
     table, reference = judged.table, REFERENCES.get(judged.name)
@@ -151,7 +155,7 @@ def _set_of(
         "what": reference.words if reference else "postures" if of_postures else "predictions",
         "files": [{"name": r.file, "sha256": r.sha256} for r in judged.ranked],
         "predictions": table.count,
-        "measures": estimates(judged, grouping, draws, oracle=oracle),
+        "measures": estimates(judged, grouping, draws, measures),
         "lifted_within_mm": dict(zip(map(str, CURVE_MM), curve(judged, grouping), strict=True)),
         "penetration": penetration(judged),
         "diversity": diversity(judged),

@@ -9,7 +9,7 @@ they are drawn independently of the objects (a two-level bootstrap). The draws c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -75,6 +75,8 @@ BINS = 5
 COMPONENTS = 5
 #: Measures of a row's best-ranked prediction.
 FIRST = ("headline", "matches", "kept", "lifted", "precision", "stable", "lifted_any")
+#: The same if an arm was asked.
+OF_ARM = ("reachable", "reached")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,7 +98,7 @@ class Judged:
         """All predictions of all seeds: `seed`, `row`, `rank`, and the contents of their verdicts.
 
         The contents are each attribute of `Verdict`, with NaN for None, and `headline`: whether the
-        prediction counts in the headline.
+        prediction counts in the headline, and `reached`, whether an arm also reaches it.
         """
         flat = [verdict for verdicts in self.verdicts for verdict in verdicts]
         said: dict[str, Any] = {
@@ -104,12 +106,14 @@ class Judged:
         }
         lengths = {name: np.array(said[name], float) for name in ("contact_error", "penetration")}
         said["posture"] = np.fromiter(said["posture"], object)
+        said["reachable"] = [bool(reachable) for reachable in said["reachable"]]
         return Table(
             said | lengths,
             seed=np.repeat(np.arange(len(self.ranked)), [len(each) for each in self.ranked]),
             row=np.concatenate([each.of_row for each in self.ranked]),
             rank=np.concatenate([each.rank for each in self.ranked]),
             headline=[verdict.counted for verdict in flat],
+            reached=[verdict.reached for verdict in flat],
         )
 
 
@@ -149,23 +153,23 @@ class Grouping:
 
 
 def estimates(
-    judged: Judged, grouping: Grouping, draws: Array, *, oracle: bool
+    judged: Judged, grouping: Grouping, draws: Array, measures: Collection[str]
 ) -> dict[str, Estimate]:
     """Return the measures of a set that have intervals, by name.
 
-    They are those of `FIRST` and two more. `success@k`, for each k that the set has, is whether any
-    of the k best predictions of a row counts in the headline. `objects` is the fraction of objects
-    with a prediction that counts.
+    They are those of `FIRST` and `OF_ARM` that are asked for, and two more. `success@k`, for each k
+    that the set has, is whether any of the k best predictions of a row counts in the headline.
+    `objects` is the fraction of objects with a prediction that counts.
 
     Args:
         judged: The set.
         grouping: Grouping of the rows.
         draws: Draws of objects, see `resample`.
-        oracle: Whether more wrist poses than the first were tried.
+        measures: Names of the measures that are asked for.
     """
     table, by_row = judged.table, dict[str, Array]()
-    for name in FIRST:
-        if name != "lifted_any" or oracle:
+    for name in (*FIRST, *OF_ARM):
+        if name in measures:
             by_row[name] = grouping.best_of_rows(judged, table[name])
     for k in KS:
         if 1 < k <= int(table.rank.max()) + 1:

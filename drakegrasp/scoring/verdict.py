@@ -154,6 +154,7 @@ class Verdict:
             hand did not close.
         seconds: Wall-clock time [s].
         reason: Why the row is invalid; empty for other rows.
+        reachable: Whether an arm reaches the first wrist pose; None if no arm was asked.
     """
 
     outcome: str
@@ -168,11 +169,17 @@ class Verdict:
     posture: tuple[float, ...]
     seconds: float
     reason: str = ""
+    reachable: bool | None = None
 
     @property
     def counted(self) -> bool:
         """Whether it counts in the headline: a sample that is made by the requested contacts."""
         return self.matches and self.kept
+
+    @property
+    def reached(self) -> bool:
+        """Whether it counts in the headline, and an arm reaches it."""
+        return self.counted and bool(self.reachable)
 
 
 def verdict_of(result: Verification) -> Verdict:
@@ -194,6 +201,7 @@ def verdict_of(result: Verification) -> Verdict:
         posture=() if closed is None or first is None else _posture(first.trial.X_OG, closed.q),
         seconds=sum(result.seconds.values()),
         reason=result.reason if result.outcome is Outcome.INVALID else "",
+        reachable=None if result.reach is None else result.reach.reachable,
     )
 
 

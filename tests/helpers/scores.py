@@ -102,5 +102,6 @@ class FakeVerify:
                 first=None,
                 farthest_contact=0.001 if lifted else np.nan,
                 seconds={"simulate": 0.5},
+                reach=None,
             )
             on_result(index, verdict_of(found))

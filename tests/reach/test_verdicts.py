@@ -51,6 +51,23 @@ def cloud() -> np.ndarray:
     return np.asarray(points[points @ [1, 1, 1] > 0.06])
 
 
+@pytest.mark.sim
+@pytest.mark.slow
+def test_a_card_counts_what_an_arm_reaches(small_dataset: Path, six: Path, tmp_path: Path) -> None:
+    data = dg.GraspDataset(small_dataset / "grasping_oto.hdf5", split="test")
+    rows = {"rows": range(4), "references": (), "workers": 1}
+    near, far = (dg.load_arm(six, (x, 0.0, 0.0, 0.0)) for x in (-0.5, -3.0))
+    grasps = data.column("grasps")[:4]
+    plain, reached, none = (dg.score(grasps, data, arm=a, **rows) for a in (None, near, far))
+    measures = [each.card["sets"]["predictions"]["measures"] for each in (plain, reached, none)]
+    assert "reachable" not in measures[0]
+    assert 0.0 < measures[1]["reached"]["value"] <= measures[1]["reachable"]["value"]
+    assert measures[2]["reachable"]["value"] == measures[2]["reached"]["value"] == 0.0
+    assert measures[1]["headline"] == measures[2]["headline"] == measures[0]["headline"]
+    with pytest.raises(dg.ConfigError, match="arm must be None with protocol dexgraspbench"):
+        dg.score(grasps, data, arm=near, protocol="dexgraspbench", **rows)
+
+
 def test_what_an_arm_does_not_reach_is_last(six: Path, cloud: np.ndarray) -> None:
     grasps = dg.propose(cloud)
     grasps = grasps.at(list(range(0, len(grasps), 4)))

@@ -9,6 +9,7 @@ import pytest
 from helpers.scores import grouping, judged, ranked_array, verdict
 
 from drakegrasp.scoring.measures import (
+    FIRST,
     Judged,
     by_name,
     calibration,
@@ -24,7 +25,7 @@ DRAWS = resample([f"object {i}" for i in range(3)])
 
 def estimated(one, *objects):
     """Return the measures of a set whose rows are of these objects."""
-    return estimates(one, grouping(*objects), DRAWS, oracle=False)
+    return estimates(one, grouping(*objects), DRAWS, FIRST[:-1])
 
 
 def of_verdicts(*verdicts, **stated):
@@ -66,7 +67,7 @@ def test_intervals_are_of_objects_and_come_again():
     assert (found["low"], found["high"]) == (0.0, 1.0)
     assert estimated(one, 0, 1, 2)["headline"] == found
     # As one object there is nothing to draw.
-    alone = estimates(one, grouping(0, 0, 0), resample(["a"]), oracle=False)["headline"]
+    alone = estimates(one, grouping(0, 0, 0), resample(["a"]), FIRST[:-1])["headline"]
     assert alone["low"] == alone["value"] == alone["high"]
 
 
