@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gc
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
 from typing import TypeVar
@@ -46,6 +46,8 @@ CAPTION = (
 )
 #: Length and radius of an arrow's head [m].
 HEAD, HEAD_RADIUS = 0.009, 0.0035
+#: Colour of what does not move, and how opaque it is if it can be seen through.
+STILL, SEEN_THROUGH = (0.6, 0.66, 0.74), 0.25
 #: Direction of the camera: azimuth about the vertical from the palm's side, and elevation [rad].
 AZIMUTH, ELEVATION = np.deg2rad(50.0), np.deg2rad(20.0)
 #: Distance of the camera in radii of a sphere around the whole lift; the hand's addition to this
@@ -63,6 +65,7 @@ def record_attempt(
     p_OQ: Array | None = None,
     nhat_Q_O: Array | None = None,
     caption: str = "",
+    still: Mapping[str, Array] | None = None,
 ) -> TrialRecord:
     """Return the result of `trial.run_attempt`, and write a recording of the attempt.
 
@@ -75,6 +78,8 @@ def record_attempt(
         p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
         nhat_Q_O: (k, 3), outward unit normals of the contacts in {O}.
         caption: Text in a corner.
+        still: What else to draw, by name: triangles (t, 3, 3) in {W} [m], of which the first are
+            solid and the others can be seen through.
 
     Raises:
         OSError: If the file cannot be written.
@@ -91,6 +96,7 @@ def record_attempt(
         _aim_camera(meshcat, scene, X_WO, config, side_W=X_WO[:3, :3] @ attempt.X_OG[:3, 3])
         record = run_attempt(scene, X_TO, attempt, config)
         _draw_predicted(meshcat, p_OQ, nhat_Q_O)
+        _draw_still(meshcat, still or {})
         return record
 
     return _record_html(run, path, caption)
@@ -121,6 +127,15 @@ def _aim_camera(
     towards = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(ELEVATION)])
     middle = X_WO[:3, 3] + way / 2.0
     meshcat.SetCameraPose(middle + DISTANCE * radius * towards, middle)
+
+
+def _draw_still(meshcat: Meshcat, still: Mapping[str, Array]) -> None:
+    """Draw triangles (t, 3, 3) in {W} [m] by their names, see `record_attempt`."""
+    for number, (name, triangles) in enumerate(still.items()):
+        corners = np.asfortranarray(triangles.reshape(-1, 3).T)
+        faces = np.asfortranarray(np.arange(corners.shape[1], dtype=np.int32).reshape(-1, 3).T)
+        colour = Rgba(*STILL, SEEN_THROUGH if number else 1.0)
+        meshcat.SetTriangleMesh(f"/still/{name}", corners, faces, colour)
 
 
 def _record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "") -> Result:

@@ -35,7 +35,7 @@ from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import even_points
 from drakegrasp.hand.parsing import Chain, add_model, find_joints, make_chains, position_order
-from drakegrasp.hand.shapes import shape_corners
+from drakegrasp.hand.shapes import hull_triangles, shape_corners
 from drakegrasp.reach.arm import TABLE_SIZE, Arm
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.seeding import Stream
@@ -114,6 +114,20 @@ class Cell:
         for index, points in self.points.items():
             X_TL = plant.EvalBodyPoseInWorld(context, plant.get_body(index)).GetAsMatrix4()
             found.append(points @ X_TL[:3, :3].T + X_TL[:3, 3])
+        return np.concatenate(found)
+
+    def arm_triangles(self, q: Array) -> Array:
+        """Return the triangles (t, 3, 3) [m] of the shapes of the arm in {T}."""
+        plant, context = self.checker.plant(), self.checker.plant_context()
+        inspector = self.checker.model().scene_graph().model_inspector()
+        self.checker.UpdatePositions(self.positions(q, np.zeros(len(self.hand_columns))))
+        found = [np.zeros((0, 3, 3))]
+        for index in self.points:
+            body = plant.get_body(index)
+            X_TL = plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+            for shape in plant.GetCollisionGeometriesForBody(body):
+                triangles = hull_triangles(shape_corners(inspector, shape))
+                found.append(triangles @ X_TL[:3, :3].T + X_TL[:3, 3])
         return np.concatenate(found)
 
 

@@ -177,6 +177,17 @@ def reach_attempt(
     return reach_grasp(cell, field, grasp)
 
 
+def draw_arm(arm: Arm, reach: Reach, config: Config) -> dict[str, Array]:
+    """Return triangles (t, 3, 3) [m] of an arm at the grasp and before the approach, in {T}.
+
+    They are empty if the grasp is not reachable.
+    """
+    if not reach.reachable:
+        return {}
+    cell = make_cell(arm, config.hand_source, mount_of(arm, load_hand(config.hand_source)))
+    return {"grasp": cell.arm_triangles(reach.q[1]), "approach": cell.arm_triangles(reach.q[0])}
+
+
 def approach_path(grasp: Grasp, step: float = STEP) -> Array:
     """Return the palm poses X_TG (m, 4, 4) from the first step before a grasp to the start."""
     path = np.tile(grasp.X_TG, (round(APPROACH / step), 1, 1))

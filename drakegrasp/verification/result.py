@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.arithmetic import norm
+from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.json_files import strict_json
@@ -25,12 +25,12 @@ from drakegrasp.dataset.manifest import finger_names, installed_versions, origin
 from drakegrasp.dataset.reader import PredictedRows
 from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.filters import Removal
-from drakegrasp.frames import Array, pack_pose
+from drakegrasp.frames import X_WT, Array, invert_pose, pack_pose, transform_points
 from drakegrasp.generation.attempts import unjudged
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.reach.arm import Arm
-from drakegrasp.reach.reaching import Reach, reach_attempt
+from drakegrasp.reach.reaching import Reach, draw_arm, reach_attempt
 from drakegrasp.runtime.environment import one_thread, timed
 from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.simulation.attempt import Attempt
@@ -95,7 +95,8 @@ class Verification:
             tried.
         margin: Epsilon, if it was computed already.
         told: The hints, if they were found already.
-        reach: What an arm can do about the first wrist pose; None if no arm was asked.
+        arm: The arm that was asked, if any.
+        reach: What it can do about the first wrist pose; None if no arm was asked.
     """
 
     grasp: PlacedGrasp
@@ -109,6 +110,7 @@ class Verification:
     stand: int = 0
     margin: float | None = None
     told: tuple[str, ...] | None = None
+    arm: Arm | None = None
     reach: Reach | None = None
 
     @property
@@ -275,7 +277,7 @@ class Verification:
         closed, about = self.first.trial.closed, (self.placed.model.field, self.first.pregrasp)
         q_closed = None if closed is None else closed.q
         reach = reach_attempt(arm, *about, self.placed.X_TO, self.config, q_closed=q_closed)
-        return replace(self, reach=reach)
+        return replace(self, arm=arm, reach=reach)
 
     def findings(self) -> dict[str, Any]:
         """Return the attributes without the grasp, whose meshes are large."""
@@ -287,7 +289,8 @@ class Verification:
         """Write an HTML file that plays the simulation in a browser, from any side.
 
         The grasp is simulated again for the file, which gives the same bits. For an invalid row,
-        the file shows the object at rest.
+        the file shows the object at rest. An arm that reaches the grasp is shown at the grasp, and
+        as a shadow where it begins its approach.
 
         Args:
             path: The file to write.
@@ -309,7 +312,20 @@ class Verification:
             p_OQ=self.p_OQ,
             nhat_Q_O=self.nhat_Q_O,
             caption=self.explain(),
+            still=self._arm_in_world(),
         )
+
+    def _arm_in_world(self) -> dict[str, Array]:
+        """Return triangles (t, 3, 3) [m] of the arm in {W}, where the object is simulated."""
+        if self.arm is None or self.reach is None:
+            return {}
+        moved = multiply(self.placed.X_TO_simulated, invert_pose(self.placed.X_TO))
+        X_WT_moved = multiply(X_WT, moved)
+        drawn = draw_arm(self.arm, self.reach, self.config)
+        return {
+            name: transform_points(X_WT_moved, triangles.reshape(-1, 3)).reshape(-1, 3, 3)
+            for name, triangles in drawn.items()
+        }
 
     def explain(self) -> str:
         """Return the verdict and its reason in a few sentences."""

@@ -22,14 +22,18 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.sim
-def test_a_verdict_tells_whether_the_arm_reaches_the_grasp(six: Path) -> None:
+def test_a_verdict_tells_whether_the_arm_reaches_the_grasp(six: Path, tmp_path: Path) -> None:
     box = trimesh.creation.box([0.06, 0.06, 0.06])
     near, far = (dg.load_arm(six, (x, 0.0, 0.0, 0.0)) for x in (-0.5, -2.0))
     verdict = dg.verify_grasp(GRASP, box, arm=near)
     assert verdict.reach is not None
     assert verdict.reach.reachable
     assert "The arm reaches it, with a clearance of " in verdict.explain()
+    verdict.save_html(tmp_path / "grasp.html")
+    text = (tmp_path / "grasp.html").read_text()
     other = verdict.reached_by(far)
+    other.save_html(tmp_path / "other.html")
+    assert len(text) > len((tmp_path / "other.html").read_text()) + 10_000  # the arm
     assert other.reach is not None
     assert other.reach.outcome == "out_of_reach"
     assert "The arm does not reach it: the palm pose is out of its reach." in other.explain()
