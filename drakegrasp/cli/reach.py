@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from cyclopts import Parameter
 
 import drakegrasp as dg
-from drakegrasp.cli.arguments import Count, Dataset, Name
+from drakegrasp.cli.arguments import Count, Dataset, Name, NewFile
 from drakegrasp.cli.console import UsageError, processes, say
 from drakegrasp.errors import counted
 
@@ -70,6 +71,7 @@ def reach(
     *,
     robot: ArmOptions = ArmOptions(),
     name: Name | None = None,
+    picture: Annotated[NewFile | None, Parameter(name="--map", metavar="PNG")] = None,
     workers: Count | None = None,
     quiet: bool = False,
 ) -> None:
@@ -81,6 +83,8 @@ def reach(
     Args:
         out: Directory of the dataset.
         name: Name of the file. [default: that of the arm]
+        picture: Instead of the file, draw a map: where on the table the arm reaches the grasps of
+            some samples.
         workers: Number of processes on this machine. [default: one per core]
         quiet: Show no progress.
     """
@@ -91,11 +95,29 @@ def reach(
     chosen = robot.asked()
     if chosen is None:
         raise UsageError("--arm must be given, got none")
+    if picture is not None:
+        _draw_map(out, chosen, picture, workers, show=not quiet)
+        return
     with processes(workers, "reach", "objects", show=not quiet) as more:
         rows = reach_dataset(out, chosen, name=name, **more)
     say(f"{counted(rows.count, 'grasp')} in {reach_path(out, name or chosen.name)}")
     for code, outcome in enumerate(REACHES):
         say(f"{outcome}: {(rows.reach_outcome == code).sum():,}")
+
+
+def _draw_map(out: Path, arm: Arm, png: Path, workers: int | None, *, show: bool) -> None:
+    """Draw where on the table an arm reaches samples of a dataset."""
+    from drakegrasp.pictures.charts import draw_reach
+    from drakegrasp.pictures.style import save_figure
+    from drakegrasp.reach.place import map_reach
+    from drakegrasp.runtime.files import validate_writable
+
+    validate_writable(png)
+    with processes(workers, "map", "objects", show=show) as more:
+        found = map_reach(out, arm, **more)
+    title = f"{arm.name} at the filled circle, {counted(found.count, 'sample')}"
+    save_figure(draw_reach(found.p_TS, found.share, arm.base, title=title), png, dpi=150)
+    say(str(png))
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:

@@ -97,6 +97,35 @@ def draw_distributions(
     return figure
 
 
+def draw_reach(p_TS: Array, share: Array, base: Sequence[float], *, title: str = "") -> Figure:
+    """Return a map of the table: which fraction of grasps an arm reaches at each place.
+
+    Args:
+        p_TS: (m, 2), places on a square grid [m].
+        share: (m,), fractions.
+        base: X, Y [m] of the arm's base, Z, and its yaw [rad].
+        title: What the figure shows; none if empty.
+    """
+    figure = Figure(figsize=(6.2, 5.4), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_title(title, fontsize="medium", color=INK)
+    count = round(np.sqrt(len(p_TS)))
+    x, y = (p_TS[:, k].reshape(count, count) for k in range(2))
+    shares = axes.pcolormesh(x, y, share.reshape(count, count), cmap="viridis", vmin=0.0, vmax=1.0)
+    figure.colorbar(shares, ax=axes, label="fraction of the samples that are reachable")
+
+    # The base, and the direction of its x axis.
+    x_base, y_base, _, yaw = base
+    axes.plot(x_base, y_base, "o", color=PREDICTED, markersize=10, markeredgecolor="white")
+    forward = x_base + 0.15 * np.cos(yaw), y_base + 0.15 * np.sin(yaw)
+    arrow = {"arrowstyle": "->", "color": PREDICTED}
+    axes.annotate("", forward, (x_base, y_base), arrowprops=arrow)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x of the object in {T} [m]")
+    axes.set_ylabel("y of the object in {T} [m]")
+    return figure
+
+
 def _histogram(axes: Axes, title: str, values: Array, groups: Mapping[str, Array]) -> None:
     """Draw the histogram of one quantity, a colour per group."""
     finite = values[np.isfinite(values)]

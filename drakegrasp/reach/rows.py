@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,9 @@ from drakegrasp.frames import Array, pack_pose, unpack_pose
 from drakegrasp.generation.scenes import OPEN_FOLLOWS_FROM, open_hands
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.parsing import position_order
+from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.reach.arm import Arm, mount_of
-from drakegrasp.reach.cell import make_cell
+from drakegrasp.reach.cell import Cell, make_cell
 from drakegrasp.reach.reaching import Grasp, reach_grasp
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.executor import Executor, in_order, run_here
@@ -80,16 +81,15 @@ def reach_dataset(
 
 def _reach(out: Path, arm: Arm, path: Path, execute: Executor, progress: Report) -> Table:
     manifest, trials = read_manifest(out), Trials(out)
-    hand = load_hand(manifest.config.hand_source)
-    joints = manifest.joints or position_order(hand.model, hand.palm_link)
-    manifest, X_FB = replace(manifest, joints=joints), mount_of(arm, hand)
-    make_cell(arm, manifest.config.hand_source, X_FB)  # fails early
+    X_FB = mount_of(arm, load_hand(manifest.config.hand_source))
+    cell = make_cell(arm, manifest.config.hand_source, X_FB)  # fails early
     attributes = _attributes(manifest, trials, arm, X_FB)
     old = _old_rows(path, attributes)
 
     # New rows, in the order of the objects, and old rows with the numbers of their trials now.
-    tasks = list(_tasks(out, manifest, trials, arm, old))
-    parts = [old] if old is not None else []
+    asked = np.isin(trials["removal"], (Removal.KEPT, Removal.UNREACHABLE))
+    tasks = list(sample_tasks(out, manifest, _without(trials[asked], old), arm))
+    parts = [_no_rows(len(cell.limits)) if old is None else old]
     progress(0, len(tasks))
     for count, columns in enumerate(in_order(execute)(reach_object, tasks), start=1):
         parts.append(Table(columns))
@@ -139,27 +139,43 @@ def _old_rows(path: Path, due: Mapping[str, Any]) -> Table | None:
         return read_columns(file["reach"], REACH_FIELDS)
 
 
-def _tasks(
-    out: Path, manifest: Manifest, trials: Trials, arm: Arm, old: Table | None
-) -> Iterator[ReachTask]:
-    """Yield a task per object, with its samples that have no row."""
-    new = trials[np.isin(trials["removal"], (Removal.KEPT, Removal.UNREACHABLE))]
-    if old is not None:
-        columns = new.columns(IDENTITY)
-        rows = rows_by_identity([old[k] for k in OWN_IDENTITY], [*columns.values()])
-        new = new[rows == NO_ROW]
-    names = new["object_name"]
+def _no_rows(joints: int) -> Table:
+    """Return a table of no grasps of an arm with a number of joints."""
+    dtypes = {f.name: object if f.dtype == "str" else f.dtype for f in REACH_FIELDS}
+    shapes = {f.name: (0, *f.row_shape({"a": joints})) for f in REACH_FIELDS}
+    return Table({name: np.zeros(shapes[name], dtypes[name]) for name in dtypes})
+
+
+def _without(trials: Trials, old: Table | None) -> Trials:
+    """Return the trials that have no row in a table."""
+    if old is None:
+        return trials
+    wanted = trials.columns(IDENTITY)
+    return trials[rows_by_identity([old[k] for k in OWN_IDENTITY], [*wanted.values()]) == NO_ROW]
+
+
+def sample_tasks(out: Path, manifest: Manifest, trials: Trials, arm: Arm) -> Iterator[ReachTask]:
+    """Yield a task for the trials of each object that has any.
+
+    Args:
+        out: Directory of the dataset.
+        manifest: Its manifest.
+        trials: The trials.
+        arm: The arm.
+    """
+    hand, names = load_hand(manifest.config.hand_source), trials["object_name"]
     for entry in manifest.objects:
-        own = new[names == entry.name]
-        yield ReachTask(
-            out=out,
-            name=entry.name,
-            config=manifest.config,
-            joints=manifest.joints,
-            arm=arm,
-            trials=own.columns(_FOLLOW_FROM),
-            trial_ids=own.trial_ids,
-        )
+        own = trials[names == entry.name]
+        if len(own):
+            yield ReachTask(
+                out=out,
+                name=entry.name,
+                config=manifest.config,
+                joints=manifest.joints or position_order(hand.model, hand.palm_link),
+                arm=arm,
+                trials=own.columns(_FOLLOW_FROM),
+                trial_ids=own.trial_ids,
+            )
 
 
 def _numbered(rows: Table, trials: Trials) -> Table:
@@ -195,6 +211,29 @@ class ReachTask:
     trials: Mapping[str, AnyArray]
     trial_ids: AnyArray
 
+    def asked(self) -> tuple[Cell, DistanceField, list[Grasp]]:
+        """Return the arm with its hand, the distances from the object, and the n grasps.
+
+        Raises:
+            DataError: If a file of the dataset is missing or damaged.
+        """
+        source, trials = self.config.hand_source, dict(self.trials)
+        cell = make_cell(self.arm, source, mount_of(self.arm, load_hand(source)))
+        prepared = load_prepared(self.out, self.name, self.config)
+        X_TO, X_OG = (unpack_pose(trials[key]) for key in ("X_TO", "X_OG"))
+        q_open = open_hands(prepared, self.config, self.joints, trials)
+        grasps = [
+            Grasp(
+                X_TO=X_TO[i],
+                X_TG=multiply(X_TO[i], X_OG[i]),
+                q_open=q_open[i],
+                q_closed=trials["closed_q"][i],
+                p_TG_lifted=np.array(self.config.lift.p_TG),
+            )
+            for i in range(len(self.trial_ids))
+        ]
+        return cell, prepared.model.field, grasps
+
 
 @one_thread
 def reach_object(task: ReachTask) -> dict[str, AnyArray]:
@@ -203,25 +242,12 @@ def reach_object(task: ReachTask) -> dict[str, AnyArray]:
     Raises:
         DataError: If a file of the dataset is missing or damaged.
     """
-    source, count = task.config.hand_source, len(task.trial_ids)
-    cell = make_cell(task.arm, source, mount_of(task.arm, load_hand(source)))
+    cell, field, grasps = task.asked()
+    count = len(grasps)
     q = np.full((count, 3, len(cell.limits)), np.nan)
     outcome, clearance = np.zeros(count, dtype=np.uint8), np.full(count, np.nan)
-    if count:
-        prepared = load_prepared(task.out, task.name, task.config)
-        q_open = open_hands(prepared, task.config, task.joints, dict(task.trials))
-
-    # One grasp after the other, each by itself.
-    X_TO, X_OG = (unpack_pose(task.trials[key]) for key in ("X_TO", "X_OG"))
-    for i in range(count):
-        grasp = Grasp(
-            X_TO=X_TO[i],
-            X_TG=multiply(X_TO[i], X_OG[i]),
-            q_open=q_open[i],
-            q_closed=task.trials["closed_q"][i],
-            p_TG_lifted=np.array(task.config.lift.p_TG),
-        )
-        found = reach_grasp(cell, prepared.model.field, grasp)
+    for i, grasp in enumerate(grasps):
+        found = reach_grasp(cell, field, grasp)
         outcome[i] = REACHES.index(found.outcome)
         q[i], clearance[i] = found.q, found.clearance
     return {

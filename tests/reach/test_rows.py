@@ -24,7 +24,7 @@ from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import MODELS, hand_names
-from drakegrasp.reach import rows
+from drakegrasp.reach import place, rows
 from drakegrasp.reach.arm import ARMS, TABLE_SIZE, Arm, load_arm, mount_of, mount_pose
 from drakegrasp.reach.rows import reach_dataset
 from drakegrasp.runtime.executor import processes
@@ -184,6 +184,25 @@ def test_check_finds_a_damaged_file_and_one_of_another_state(out: Path) -> None:
     middle = len(content) // 2
     path.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
     assert "the file must be as it was written" in [found.what for found in check_dataset(out)]
+
+
+def test_a_map_of_places(
+    out: Path, arm: Arm, six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(place, "SPACING", 0.7)
+    monkeypatch.setattr(place, "MOST", 3)
+    found = place.map_reach(out, arm)
+    assert found.count == 3
+    assert found.p_TS.tolist() == [[x, y] for x in (-0.7, 0, 0.7) for y in (-0.7, 0, 0.7)]
+    assert found.share[7] == 0.0  # 1.2 m from the base
+    # To move the object is to move the base the other way.
+    moved = place.map_reach(out, load_arm(six, (-0.5, -0.7, 0.0, 0.0)))
+    assert moved.share[3] == found.share[4] > 0.0
+
+    png = tmp_path / "map.png"
+    given = ("reach", out, "--arm", six, "--base", BASE, "--workers", 1, "--quiet")
+    assert run(*given, "--map", png).stdout == f"{png}\n"
+    assert png.read_bytes().startswith(b"\x89PNG")
 
 
 # Arms
