@@ -26,7 +26,7 @@ from drakegrasp.dataset.manifest import (
     package_versions,
     release_directory,
 )
-from drakegrasp.dataset.paths import MANIFEST_FILE, places
+from drakegrasp.dataset.paths import MANIFEST_FILE, places, reach_path
 from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import ConfigError, DataError, counted, listed
 from drakegrasp.hand.description import load_hand
@@ -120,6 +120,7 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
     Raises:
         DataError: If the directory cannot be used, another process builds there, or the dataset
             has a mesh that is not among the objects.
+        ConfigError: If `filters.reachable` names an arm that was not asked.
         HandError: If the hand's files cannot be read.
         DiskFullError: If the disk is full, also if it fills while the block runs.
     """
@@ -127,6 +128,7 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
         known = claim_directory(out, config)
         if known is not None:
             _validate_complete(known, names, out)
+        _validate_reach(config, out)
         config = carry_hand(out, config, known.config.hand if known else None)
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
         if swept := [str(path.relative_to(out)) for path in sweep_temporary(out)]:
@@ -142,6 +144,15 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
         finally:
             if not (out / MANIFEST_FILE).exists():
                 release_directory(out)
+
+
+def _validate_reach(config: Config, out: Path) -> None:
+    """Reject a filter of an arm that was not asked; it could only fail when all is simulated."""
+    name = config.filters.reachable
+    if name is not None and not reach_path(out, name).is_file():
+        raise ConfigError(
+            f"filters.reachable must be null until `drakegrasp reach` has asked the arm, got {name}"
+        )
 
 
 def _manifest(config: Config, known: Manifest | None) -> Manifest:

@@ -320,7 +320,7 @@ def sweep_temporary(out: Path) -> list[Path]:
 
 
 def _temporary_files(out: Path) -> Iterator[Path]:
-    for pattern in ("", "objects", "shards/*"):
+    for pattern in ("", "objects", "reach", "shards/*"):
         for folder in out.glob(pattern) if pattern else [out]:
             if folder != out and (folder.is_symlink() or folder.parent.is_symlink()):
                 continue

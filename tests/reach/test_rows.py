@@ -186,6 +186,15 @@ def test_check_finds_a_damaged_file_and_one_of_another_state(out: Path) -> None:
     assert "the file must be as it was written" in [found.what for found in check_dataset(out)]
 
 
+def test_a_build_rejects_an_arm_that_was_not_asked(small_meshes: Path, tmp_path: Path) -> None:
+    new = tmp_path / "new"
+    given = ("build", "--objects", small_meshes, "--out", new, "--set", "filters.reachable=six")
+    assert error_line(run(*given)) == (
+        "error: filters.reachable must be null until `drakegrasp reach` has asked the arm, got six"
+    )
+    assert not new.exists()
+
+
 def test_a_map_of_places(
     out: Path, arm: Arm, six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
