@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, reach_names
 from drakegrasp.dataset.quality import PARTS
-from drakegrasp.dataset.rejections import REJECT_FILE, Decisions
+from drakegrasp.dataset.reach import IDENTITY, is_reachable
+from drakegrasp.dataset.rejections import REJECT_FILE, AttemptKey, Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, TRIAL_FIELDS, Shown
 from drakegrasp.dataset.successes import own_setting
 from drakegrasp.dataset.trials import NONE
@@ -240,4 +242,15 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
             if field.shown is not None and field.name not in in_parts
         ),
         ("other links after closing", str(int(row["closed_other_links"])) if closed else "–"),
+        *_reach_facts(snapshot.out, key),
     ]
+
+
+def _reach_facts(out: Path, key: AttemptKey) -> Iterator[tuple[str, str]]:
+    """Yield for each arm that was asked for an attempt whether it reaches it."""
+    values = (key.object, key.candidate, key.standoff_index)
+    columns = {name: np.array([v]) for name, v in zip(IDENTITY, values, strict=True)}
+    for name in reach_names(out):
+        (asked,), (reachable,) = is_reachable(out, name, columns)
+        if asked:
+            yield f"arm {name}", "reaches it" if reachable else "does not reach it"

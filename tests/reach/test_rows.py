@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.arms import write_arm
 from helpers.commands import error_line, run
+from starlette.testclient import TestClient
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
@@ -24,6 +25,7 @@ from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import MODELS, hand_names
+from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.reach import place, rows
 from drakegrasp.reach.arm import ARMS, TABLE_SIZE, Arm, load_arm, mount_of, mount_pose
 from drakegrasp.reach.rows import reach_dataset
@@ -139,6 +141,16 @@ def test_the_filter_of_reachable_grasps(out: Path, arm: Arm) -> None:
     assert reach_dataset(out, arm).count == whole.count
     with pytest.raises(DataError, match=r"seven.hdf5: must be the reach of an arm, got none"):
         assemble(out, overrides=["filters.reachable=seven"])
+
+
+def test_the_page_of_a_grasp_names_the_arms_that_were_asked(asked: Path) -> None:
+    with h5py.File(reach_path(asked, "six")) as file:
+        trial, reachable = (int(file["reach"][name][0]) for name in ("trial_id", "reachable"))
+    client = TestClient(make_app(Inspection(asked)), base_url="http://127.0.0.1")
+    text = client.get(f"/grasp/{trial}").text
+    assert "arm six" in text
+    assert ("reaches it" if reachable else "does not reach it") in text
+    assert "arm six" not in client.get(f"/grasp/{trial + 1}").text
 
 
 def test_a_file_of_another_arm_is_not_replaced(out: Path, six: Path) -> None:
