@@ -190,7 +190,39 @@ def test_why_a_grasp_is_not_reachable(six: Path, box: ObjectModel) -> None:
 
 
 def test_the_hand_must_not_meet_the_object_on_its_way(six: Path, box: ObjectModel) -> None:
-    """From the side, the open hand would come through a second box; a hull knows no hole."""
+    """The Barrett Hand's palm is 1.35 mm in front of {G}, and 2.5 mm may overlap."""
     cell = cell_of(six)
-    inside = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, HEIGHT - 0.04])
-    assert reach_grasp(cell, box.field, top_grasp(cell, X_TG=inside)).outcome == "approach"
+    for height, outcome in ((-0.04, "approach"), (-0.012, "approach"), (0.0, "reachable")):
+        X_TG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, HEIGHT + height])
+        grasp = top_grasp(cell, X_TG=X_TG, q_closed=hand_at(cell, 0.0))
+        assert reach_grasp(cell, box.field, grasp).outcome == outcome
+
+
+def test_the_arm_must_not_meet_the_object(six: Path, tmp_path: Path) -> None:
+    """From behind a post the arm reaches around it, but not over a wall."""
+    cell = cell_of(six, (-0.35, 0.0, 0.0, 0.0))
+    back = make_pose([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], [0.1, 0.0, 0.4])
+    about = {
+        "X_TO": make_pose(np.eye(3), [0.0, 0.0, 0.25]),
+        "X_TG": back,
+        "p_TG_lifted": np.array([0.1, 0.0, 0.45]),
+    }
+    for name, width, reachable in (("post", 0.06, True), ("wall", 0.9, False)):
+        (tmp_path / name).mkdir()
+        model = box_model(tmp_path / name, [0.04, width, 0.5])
+        assert reach_grasp(cell, model.field, top_grasp(cell, **about)).reachable == reachable
+
+
+def test_the_object_moves_with_the_hand(six: Path, tmp_path: Path) -> None:
+    """A plate below the arm is lifted into it, if it is lifted high."""
+    cell = cell_of(six, (-0.45, 0.0, 0.0, 0.0))
+    plate = box_model(tmp_path, [0.6, 0.3, 0.03])
+    for height, outcome in ((0.3, "reachable"), (0.45, "lift")):
+        grasp = top_grasp(
+            cell,
+            X_TO=make_pose(np.eye(3), [-0.06, 0.0, 0.015]),
+            X_TG=make_pose(np.diag([1.0, -1.0, -1.0]), [0.19, 0.0, 0.13]),
+            q_closed=hand_at(cell, 0.0),
+            p_TG_lifted=np.array([0.19, 0.0, height]),
+        )
+        assert reach_grasp(cell, plate.field, grasp).outcome == outcome
