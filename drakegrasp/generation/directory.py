@@ -129,6 +129,8 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
         if known is not None:
             _validate_complete(known, names, out)
         _validate_reach(config, out)
+
+        # The directory can be used: from here on, its files are changed.
         config = carry_hand(out, config, known.config.hand if known else None)
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
         if swept := [str(path.relative_to(out)) for path in sweep_temporary(out)]:
