@@ -147,6 +147,9 @@ def test_what_collides(six: Path) -> None:
     assert cell.table_distance(low, closed) < 0.0
     # The fore arm folds into the upper arm.
     assert not cell.is_free(up + 3.0 * np.eye(6)[2], closed)
+    # Fingers that overlap are the hand's own matter.
+    allegro = cell_of(six, hand="allegro")
+    assert allegro.is_free(up, hand_at(allegro, 1.2))
     # Beside the table there is nothing below.
     assert cell_of(six, (-2.0, 0.0, 0.0, 0.0)).is_free(low, closed)
 
