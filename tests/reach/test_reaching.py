@@ -138,7 +138,8 @@ def test_what_collides(six: Path) -> None:
     closed = hand_at(cell, 0.5)
     up, flat = np.zeros(6), np.array([0.0, np.pi / 2.0, 0.0, 0.0, 0.0, 0.0])
     assert cell.is_free(up, closed)
-    assert cell.table_distance(up, closed) < 0.2  # the shoulder is 90 mm above the table
+    # The shoulder, a ball of 60 mm, is 150 mm above the table.
+    assert cell.table_distance(up, closed) == pytest.approx(0.09, abs=1e-3)
     assert cell.is_free(flat, closed)
     # The fore arm lies 0.11 m above the table; turned down by 0.4 rad it enters the table.
     assert 0.0 < cell.table_distance(flat, closed) < 0.11
