@@ -48,7 +48,7 @@ def count_reach(out: Path) -> list[ReachCount]:
     Raises:
         DataError: If a file is damaged.
     """
-    found, samples = [], Trials(out).where(sample=True)
+    found, samples = [], Trials(out).where(kept=True)
     columns = samples.columns((*IDENTITY, "X_TO", "X_OG"))
     X_TO, X_OG = (unpack_pose(columns[name]) for name in ("X_TO", "X_OG"))
     bands = elevation_bands(multiply(X_TO, X_OG))

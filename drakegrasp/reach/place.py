@@ -62,7 +62,7 @@ def map_reach(
         ConfigError: If the arm, or the dataset's hand on it, cannot be used.
         DataError: If there is no dataset, or it is damaged.
     """
-    manifest, samples = read_manifest(Path(out)), Trials(out).where(sample=True)
+    manifest, samples = read_manifest(Path(out)), Trials(out).where(kept=True)
     source = manifest.config.hand_source
     make_cell(arm, source, mount_of(arm, load_hand(source)))  # fails early
     chosen = np.unique(np.linspace(0, len(samples) - 1, min(MOST, len(samples))).astype(int))

@@ -14,7 +14,7 @@ from drakegrasp.frames import Array, invert_pose, make_pose, rotation_about, rot
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.reach.arm import load_arm, mount_of
+from drakegrasp.reach.arm import load_arm, mount_of, mount_pose
 from drakegrasp.reach.branches import find_branches, flange_poses, follow
 from drakegrasp.reach.cell import Cell, make_cell
 from drakegrasp.reach.reaching import Grasp, approach_path, lift_path, reach_grasp
@@ -169,6 +169,12 @@ def test_a_reachable_grasp(six: Path, box: ObjectModel) -> None:
         assert np.abs(X[:3, 3]).max() < 1e-3
         assert rotation_angle(X[:3, :3]) < np.deg2rad(0.5)
         assert cell.is_free(q, grasp.q_open)
+    # The palm link is where the mount says.
+    mount = mount_pose([0.01, 0.0, 0.02], [0.0, 0.0, 30.0])
+    cell = make_cell(load_arm(six, BASE), "barrett", mount)
+    q = reach_grasp(cell, box.field, grasp).q[1]
+    X_TB = pose_by_drake(cell, q, "flange") @ mount
+    np.testing.assert_allclose(X_TB @ cell.hand.X_BG, grasp.X_TG, atol=1e-3)
     np.testing.assert_allclose(approach_path(grasp)[-1][:3, 3], [0.0, 0.0, HEIGHT + 0.18])
     np.testing.assert_allclose(lift_path(grasp)[-1][:3, 3], grasp.p_TG_lifted)
     again = reach_grasp(cell_of(six), box.field, grasp)

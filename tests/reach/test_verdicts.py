@@ -44,7 +44,7 @@ def test_a_verdict_tells_whether_the_arm_reaches_the_grasp(six: Path, tmp_path: 
     moved = dg.verify_grasp(GRASP, dg.place_object(box, X_TO=X_TO), arm=far)
     assert moved.reach is not None
     assert moved.reach.reachable
-    assert moved.held == verdict.held
+    assert moved.lifted == verdict.lifted
     assert dg.verify_grasp(np.full(18, np.nan), box, arm=near).reach is None
 
 
