@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drakegrasp.api.building import build_dataset, make_benchmark
+    from drakegrasp.api.predicting import predict_scenes
     from drakegrasp.api.scoring import score
     from drakegrasp.api.verifying import (
         verify_grasp,
@@ -92,6 +93,7 @@ _HOMES = {
     "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",
+    "predict_scenes": "api.predicting",
     "propose": "scoring.predicting",
     "rank": "scoring.ranking",
     "reach_dataset": "reach.rows",
@@ -143,6 +145,7 @@ __all__ = [
     "make_posture",
     "pack_grasp",
     "place_object",
+    "predict_scenes",
     "propose",
     "rank",
     "reach_dataset",

@@ -86,6 +86,7 @@ PY_NOT_RUN = {
     'dg.load_arm("panda"': "wants the extra arms; tests/reach/test_verdicts.py",
     "read_closed_grasps(out)": "an exporter of the reader; tests/test_plugin.py",
     "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
+    "dg.predict_scenes(": "wants scenes and a cluster; tests/cli/test_predict_scenes.py",
     "dg.SceneDataset(": "wants scenes and torch; tests/dataset/test_scene_reader.py",
     'dg.verify_grasp(grasp, "mug.obj"': "tests/test_api.py",
     'dg.place_object("mug.obj"': "tests/verification/test_verify.py",

@@ -12,7 +12,7 @@ from cyclopts.validators import Number
 
 import drakegrasp as dg
 from drakegrasp.cli.arguments import AnyPath, Count, File, Positive, Settings, Split, Units
-from drakegrasp.cli.console import UsageError, processes, say, wrong_input
+from drakegrasp.cli.console import UsageError, say, wrong_input
 from drakegrasp.cli.reach import ArmOptions
 from drakegrasp.errors import GraspError, MeshError
 
@@ -109,7 +109,8 @@ def predict(
     how: dict[str, Any] = {"overrides": overrides, "count": count, "show": not quiet}
     arm = robot.asked()
     if kind == "scenes":
-        found, hand = _of_scenes(source, split or "test", simulate or 0, workers, **how)
+        how |= {"split": split or "test", "simulate": simulate or 0, "workers": workers}
+        found, hand = _of_scenes(source, **how)
     else:
         tries = SIMULATED if simulate is None else simulate
         how["arm"] = arm
@@ -178,21 +179,21 @@ def _validate_options(kind: str, options: dict[str, Any]) -> None:
 
 
 def _of_scenes(
-    path: Path, split: str, simulate: int, workers: int | None, *, show: bool, **how: Any
+    path: Path, *, overrides: tuple[str, ...], show: bool, **how: Any
 ) -> tuple[GraspTable, Hand]:
     """Return the grasps for the views of a split and their hand; print how many there are."""
-    from drakegrasp.scoring.predicting import predict_scenes
+    from drakegrasp.dataset.manifest import read_manifest
+    from drakegrasp.hand.settings import override_config
 
-    how |= {"split": split, "simulate": simulate}
-    with processes(workers, "predict", "views", show=show) as more, wrong_input():
-        how |= {"execute": more["execute"], "report": more["progress"]}
-        found, blind, hand = predict_scenes(path, **how)
+    with wrong_input():
+        found, blind = dg.predict_scenes(path, overrides=overrides, show=show, **how)
+        config = override_config(read_manifest(path.parent).config, overrides)
     if show:
         views = len(set(found.of_row.tolist()))
         say(f"{len(found):,} grasps of {views:,} views", err=True)
     if blind:
         say(f"{blind:,} views show too little of their object: no grasp", err=True)
-    return found, hand
+    return found, dg.load_hand(config.hand_source)
 
 
 def _of_object(

@@ -140,7 +140,7 @@ def predict_scenes(
     overrides: Sequence[str] = (),
     execute: Executor = run_here,
     report: Report = silent,
-) -> tuple[GraspTable, int, Hand]:
+) -> tuple[GraspTable, int]:
     """Return grasps for all views of a split, in the frames of their objects.
 
     The rows of the views are those of `drakegrasp score`, see `dataset.scenes.SceneRows`.
@@ -155,8 +155,8 @@ def predict_scenes(
         report: Called after each view.
 
     Returns:
-        Postures with the row that each is for (`of_row`), its resting pose and its confidence; the
-        number of views that show too little of their object for any; and the hand.
+        Postures with the row that each is for (`of_row`), its resting pose and its confidence; and
+        the number of views that show too little of their object for any.
 
     Raises:
         DataError: If the file cannot be used.
@@ -178,7 +178,7 @@ def predict_scenes(
             f"{path}: must have views with a sample in {split} that show their object, got "
             f"{len(data)} views"
         )
-    return join_attempts(tables), len(data) - len(tables), load_hand(config.hand_source)
+    return join_attempts(tables), len(data) - len(tables)
 
 
 class _SceneView(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import h5py
 import numpy as np
@@ -12,8 +13,10 @@ from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from PIL import Image
 
+import drakegrasp as dg
 from drakegrasp.dataset.scenes import SceneDataset, SceneRows
 from drakegrasp.dataset.schema import DEPTH_UNIT
+from drakegrasp.errors import ConfigError
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
@@ -22,6 +25,9 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.scoring.predicting import predict
 from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.vision.depth_image import cloud_from_depth
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 pytestmark = pytest.mark.sim
 #: The views of the training split, of which there are few.
@@ -60,6 +66,19 @@ def predicted(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert result.exit_code == 0, result.output
     assert result.stdout.split() == [str(path)]
     return path
+
+
+@pytest.mark.cluster
+def test_a_client_predicts_the_same(scenes: Path) -> None:
+    with pytest.raises(ConfigError, match="workers must not be given with a client, got both"):
+        dg.predict_scenes(scenes, client=cast("Client", object()), workers=2)
+    expected, blind = dg.predict_scenes(scenes, split="train", simulate=1, count=2, workers=1)
+    assert np.isfinite(expected.confidence).all() and blind == 0
+    with dg.connect(2) as client:
+        found = dg.predict_scenes(scenes, split="train", simulate=1, count=2, client=client)
+    assert found[1] == 0
+    for name in ("X_FG", "q_grasp", "of_row", "resting", "confidence"):
+        np.testing.assert_array_equal(getattr(found[0], name), getattr(expected, name))
 
 
 def test_grasps_of_scenes_are_those_of_their_views(
