@@ -22,7 +22,7 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
-from drakegrasp.dataset.assemble import file_attributes, shards_sha256
+from drakegrasp.dataset.assemble import file_attributes, object_columns, shards_sha256
 from drakegrasp.dataset.hdf5 import (
     REACH,
     SAMPLES,
@@ -33,6 +33,7 @@ from drakegrasp.dataset.hdf5 import (
     mistakes,
     open_hdf5,
     open_samples,
+    open_trials,
     read_columns,
     says_damage,
 )
@@ -51,6 +52,7 @@ from drakegrasp.dataset.paths import (
 )
 from drakegrasp.dataset.schema import (
     CAMERAS,
+    OBJECT_FIELDS,
     POSITIVE,
     ROW_NUMBERS,
     SPLITS,
@@ -223,6 +225,8 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
         compared = sound and (name in cameras or name in arms) and not header.mistakes
         if compared and name in cameras:
             tasks.append(partial(_samples, out / name))
+        if name == TRIALS_FILE and sound:
+            tasks.append(partial(_objects, out))
         tasks.append(partial(_seal, out / name, name))
         rows = _Rows(
             path=out / name,
@@ -283,6 +287,20 @@ def _seal(path: Path, name: str) -> list[Violation]:
     found = list[Violation]()
     with _reported(found, name, "the file must be as it was written"):
         validate_seal(path, "file", None)
+    return found
+
+
+def _objects(out: Path) -> list[Violation]:
+    """Return a violation if the objects of trials.hdf5 are not those of the manifest."""
+    found, due = list[Violation](), object_columns(read_manifest(out))
+    with _reported(found, TRIALS_FILE, f"the objects must be those of {MANIFEST_FILE}"):
+        with open_trials(out / TRIALS_FILE) as file:
+            stored = read_columns(file["objects"], OBJECT_FIELDS)
+        if stored.count != len(due["name"]):
+            raise DataError(f"they must be {len(due['name'])}, got {stored.count}")
+        for name, values in due.items():
+            if (bad := _differs(stored[name], values)).any():
+                raise DataError(f"{name} must be as there, got another in row {np.argmax(bad)}")
     return found
 
 

@@ -79,7 +79,11 @@ def _nothing(out: Path) -> None:
         ),
         (_cut_shard, [], "damaged or cut off"),
         (_nothing, ["--set", "filters.max_slip=-1"], "must be greater than 0"),
-        (_nothing, ["--set", "lift.hold_time=9"], "only values of filters and split can change"),
+        (
+            _nothing,
+            ["--set", "lift.hold_time=9"],
+            "filters, split, verify can change, got one that changes what was simulated",
+        ),
     ],
     ids=["reject", "shard", "value", "key"],
 )

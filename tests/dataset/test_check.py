@@ -130,6 +130,30 @@ def test_files_of_other_shards_are_found(out: Path) -> None:
     must_find(out, *((name, "", None, what) for name in FILES))
 
 
+def _one_more(file: h5py.File) -> None:
+    group = file["objects"]
+    for name in [*group]:
+        values, attrs = group[name][:], dict(group[name].attrs)
+        dtype = group[name].dtype
+        del group[name]
+        group.create_dataset(name, data=np.append(values, values[:1]), dtype=dtype)
+        group[name].attrs.update(attrs)
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda file: file["objects/name"].__setitem__(1, b"a\x1b]0;x\x07"),
+        lambda file: file["objects/mass"].write_direct(2.0 * file["objects/mass"][:]),
+        _one_more,
+    ],
+    ids=["name", "mass", "one more"],
+)
+def test_objects_of_trials_are_those_of_the_manifest(out: Path, edit: Callable[..., Any]) -> None:
+    edit_file(out / TRIALS, edit)
+    must_find(out, (TRIALS, "", None, "the objects must be those of manifest.json"), of=TRIALS)
+
+
 def test_files_are_of_the_manifests_configuration(out: Path) -> None:
     manifest = read_manifest(out)
     config = override_config(manifest.config, ["split.valid_fraction=0.3"])

@@ -70,9 +70,9 @@ def test_items_are_the_same_in_both_frames(path: Path) -> None:
 def test_good_and_bad_grasps_come_in_turns(path: Path) -> None:
     data = SceneDataset(path, points=16, grasps=6, split="test")
     for item in data:
-        assert item["sample"].tolist() == [True, False] * 3
+        assert item["kept"].tolist() == [True, False] * 3
         assert item["tested"].all() and not item["lifted"][1::2].any()
-    assert all(item["sample"].all() for item in SceneDataset(path, points=16, negatives="none"))
+    assert all(item["kept"].all() for item in SceneDataset(path, points=16, negatives="none"))
     closed = SceneDataset(path, points=16, grasps=64, negatives="closed")[0]
     assert not closed["tested"].all() and closed["lifted"][::2].all()
 
