@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -123,8 +124,7 @@ def test_grasps_of_scenes_become_a_dataset(
     small_dataset: Path, small_meshes: Path, tmp_path: Path
 ) -> None:
     """The loop: a build, its scenes, grasps for them, and a build of these grasps."""
-    out = tmp_path / "out"
-    out.symlink_to(small_dataset)
+    out = Path(shutil.copytree(small_dataset, tmp_path / "out"))
     make_scenes(out, overrides=["scenes.views=1"])
     path, tried = tmp_path / "predicted.h5", tmp_path / "tried"
     result = run("predict", out / "scenes.hdf5", "--split", "train", "--out", path, "--count", 1)
