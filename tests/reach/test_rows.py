@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from unittest.mock import Mock
+from xml.etree import ElementTree
 
 import h5py
 import numpy as np
@@ -18,8 +21,9 @@ from starlette.testclient import TestClient
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.paths import reach_path
-from drakegrasp.dataset.reach import count_reach
+from drakegrasp.dataset.reach import IDENTITY, count_reach, is_reachable
 from drakegrasp.dataset.rejections import AttemptKey
+from drakegrasp.dataset.schema import REACHES
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
@@ -28,6 +32,7 @@ from drakegrasp.hand.file_format import MODELS, hand_names
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.reach import place, rows
 from drakegrasp.reach.arm import ARMS, TABLE_SIZE, Arm, load_arm, mount_of, mount_pose
+from drakegrasp.reach.reaching import Reach
 from drakegrasp.reach.rows import reach_dataset
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.files import seal
@@ -59,6 +64,22 @@ def out(asked: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(asked, tmp_path / "out"))
 
 
+@pytest.fixture
+def mixed(out: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A dataset with a file `mixed` in which the rows have each outcome in turn."""
+    turns = cycle(REACHES)
+
+    def answer(*_: object) -> Reach:
+        outcome = next(turns)
+        value = 0.1 if outcome == "reachable" else np.nan
+        return Reach(outcome=outcome, q=np.full((3, 6), value), clearance=value)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rows, "reach_grasp", answer)
+        reach_dataset(out, arm, name="mixed")
+    return out
+
+
 def test_a_row_per_sample(asked: Path, arm: Arm) -> None:
     trials = Trials(asked)
     samples = trials[trials["removal"] == Removal.KEPT]
@@ -79,6 +100,33 @@ def test_the_command_on_any_number_of_workers(out: Path, six: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "reachable: " in result.stdout
     assert reach_path(out, "again").read_bytes() == first
+
+
+def test_only_the_first_outcome_is_reachable(mixed: Path) -> None:
+    with h5py.File(reach_path(mixed, "mixed")) as file:
+        found = {name: file["reach"][name][:] for name in ("reachable", "reach_outcome", "q_lift")}
+    turns = np.arange(len(found["reachable"])) % len(REACHES)
+    assert len(turns) > len(REACHES)
+    assert found["reach_outcome"].tolist() == turns.tolist()
+    np.testing.assert_array_equal(found["reachable"], turns == 0)
+    np.testing.assert_array_equal(np.isfinite(found["q_lift"]), (turns == 0)[:, None] & [True] * 6)
+    assert not check_dataset(mixed)
+
+
+def test_a_grasp_has_the_answer_of_its_own_row(mixed: Path) -> None:
+    samples = Trials(mixed).where(kept=True)
+    columns = samples.columns(IDENTITY)
+    expected = np.arange(len(samples)) % len(REACHES) == 0
+    for chosen in (slice(None, None, -1), slice(3, 8, 2)):
+        some = {name: column[chosen] for name, column in columns.items()}
+        asked, reachable = is_reachable(mixed, "mixed", some)
+        assert asked.all()
+        assert reachable.tolist() == expected[chosen].tolist()
+    # Of a grasp that the arm was not asked for, nothing is said.
+    other = {**columns, "candidate": np.append(columns["candidate"][:-1], 10**6)}
+    asked, reachable = is_reachable(mixed, "mixed", other)
+    assert asked.tolist() == [True] * (len(samples) - 1) + [False]
+    assert reachable.tolist() == [*expected[:-1], False]
 
 
 @pytest.mark.nightly
@@ -122,22 +170,26 @@ def test_stats_count_by_elevation(asked: Path) -> None:
     assert said == {"name": "six", "asked": [0, 0, 9], "reachable": [0, 0, reachable]}
 
 
-def test_the_filter_of_reachable_grasps(out: Path, arm: Arm) -> None:
+def test_the_filter_of_reachable_grasps(
+    out: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, whole = reach_path(out, "six"), reach_dataset(out, arm)
     with h5py.File(path, "r+") as file:  # as if the arm reached all but two
-        rows = file["reach"]
-        rows["reachable"][...] = np.arange(whole.count) >= 2
+        group = file["reach"]
+        group["reachable"][...] = np.arange(whole.count) >= 2
         for name in ("q_approach", "q_grasp", "q_lift"):
-            rows[name][...] = np.where(np.arange(whole.count)[:, None] >= 2, 0.0, np.nan)
-        rows["clearance"][...] = np.where(np.arange(whole.count) >= 2, 0.1, np.nan)
-        rows["reach_outcome"][...] = np.arange(whole.count) < 2
+            group[name][...] = np.where(np.arange(whole.count)[:, None] >= 2, 0.0, np.nan)
+        group["clearance"][...] = np.where(np.arange(whole.count) >= 2, 0.1, np.nan)
+        group["reach_outcome"][...] = np.arange(whole.count) < 2
     seal(path)
     assemble(out, overrides=["filters.reachable=six"])
     removal = Trials(out)[whole.trial_id]["removal"]
     assert removal[:2].tolist() == [Removal.UNREACHABLE] * 2
     assert not removal[2:].any()
     assert not check_dataset(out)
-    # The arm is still asked for them, and a file that is not there is named.
+    # Another arm is asked for them, too, the same arm not again; a file that is missing is named.
+    assert reach_dataset(out, arm, name="other").count == whole.count
+    monkeypatch.setattr(rows, "reach_grasp", Mock(side_effect=AssertionError))
     assert reach_dataset(out, arm).count == whole.count
     with pytest.raises(DataError, match=r"seven.hdf5: must be the reach of an arm, got none"):
         assemble(out, overrides=["filters.reachable=seven"])
@@ -261,6 +313,7 @@ def test_a_file_that_is_no_arm(tmp_path: Path, message: str) -> None:
 
 BAD_OPTIONS = {
     "arm must be panda, ur5, ur10 or a .urdf file, got 'pandas'": ("--arm", "pandas"),
+    "arm must be panda, ur5, ur10 or a .urdf file, got 'arm.sdf'": ("--arm", "arm.sdf"),
     "a joint must move the flange 'base', got none": ("--flange", "base"),
     "flange must be a link of six.urdf, got 'tool'": ("--flange", "tool"),
     "base must be on the table, z >= 0, or beside it, |x| or |y| >= 0.8 m, got x=0.1, y=0, "
@@ -276,6 +329,54 @@ BAD_OPTIONS = {
 def test_bad_options_are_one_line(asked: Path, six: Path, message: str) -> None:
     given = ("reach", asked, "--arm", six, "--base", BASE, "--quiet", *BAD_OPTIONS[message])
     assert message in error_line(run(*given))
+
+
+def test_a_mesh_is_where_its_origin_puts_it(tmp_path: Path) -> None:
+    """The upper arm is a box of 80 x 80 x 480 mm, at 250 mm along z."""
+    ends = {
+        "0 0 0": ([-0.04, -0.04, 0.01], [0.04, 0.04, 0.49]),
+        "0 1.570796 0": ([-0.24, -0.04, 0.21], [0.24, 0.04, 0.29]),
+        "1.570796 0 1.570796": ([-0.24, -0.04, 0.21], [0.24, 0.04, 0.29]),
+    }
+    for rpy, expected in ends.items():
+        placed = ('xyz="0 0 0.25"', f'xyz="0 0 0.25" rpy="{rpy}"')
+        ((link, corners),) = load_arm(write_arm(tmp_path, replace=placed), (0, 0, 0, 0)).hulls
+        p_LC = np.frombuffer(corners).reshape(-1, 3)
+        assert link == "upper"
+        np.testing.assert_allclose([p_LC.min(axis=0), p_LC.max(axis=0)], expected, atol=1e-6)
+
+
+def test_what_is_beyond_the_flange_is_left_out(tmp_path: Path) -> None:
+    """A camera beside the way to the flange stays, as do the links before it."""
+    beside = (
+        "</robot>",
+        '<link name="camera"/><joint name="clip" type="fixed"><parent link="shoulder"/>'
+        '<child link="camera"/></joint></robot>',
+    )
+    path = write_arm(tmp_path, replace=beside)
+    for flange, links, joints in (
+        ("flange", "base shoulder upper fore one two three flange camera", 6),
+        ("two", "base shoulder upper fore one two camera", 5),
+        ("shoulder", "base shoulder", 1),
+    ):
+        arm = load_arm(path, (0.0, 0.0, 0.0, 0.0), flange=flange)
+        assert [e.get("name") for e in ElementTree.fromstring(arm.urdf).iter("link")] == (
+            links.split()
+        )
+        assert len(arm.joints) == joints
+        assert bool(arm.hulls) == ("upper" in links)
+
+
+def test_a_hand_without_a_mount_is_one_line(six: Path) -> None:
+    own = replace(load_hand(), name="own")
+    arm, stated = (load_arm(six, (0.0, 0.0, 0.0, 0.0), mount=X) for X in (None, np.eye(4)))
+    with pytest.raises(ConfigError) as caught:
+        mount_of(arm, own)
+    assert str(caught.value) == (
+        "mount must be given for a hand other than barrett, franka, allegro, allegro_four, leap, "
+        "got 'own'"
+    )
+    np.testing.assert_array_equal(mount_of(stated, own), np.eye(4))
 
 
 def test_mounts(six: Path) -> None:
