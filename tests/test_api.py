@@ -19,11 +19,7 @@ from helpers.datasets import make_dataset
 
 from drakegrasp.api import building, verifying
 from drakegrasp.api.building import build_dataset
-from drakegrasp.api.verifying import (
-    run_verification,
-    verify_grasp,
-    verify_grasps,
-)
+from drakegrasp.api.verifying import run_verification, verify_grasp, verify_grasps
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared, save_prepared

@@ -32,7 +32,6 @@ import torch
 from assess import assessment, auc
 from batches import centred, object_points, turned
 from fitting import ahead
-from model_card import card_text
 from networks import (
     ContactNetwork,
     GraspClassifier,
@@ -325,20 +324,3 @@ def test_reliability_bins_have_what_is_said_and_what_is_true() -> None:
     assert found["auc"][0] == 1.0 and found["brier"] == round(
         float(np.square(chance - (chance >= 0.5)).mean()), 4
     )
-
-
-def test_a_model_card_has_the_scores_that_it_was_given() -> None:
-    history = {"train": [1.0, 0.5], "valid": [2.0, 3.0], "best": 0, "parts": {"train": 7}}
-    checkpoint = {
-        "task": "postures", "weights": {"w": torch.zeros(3, 4)}, "history": history, "data": ["ab"],
-        "settings": {"seed": 1}, "versions": {"torch": "2"},
-    }  # fmt: skip
-    score = {
-        "form": "drakegrasp-score-1", "measures": {"headline": "a sample"}, "objects": 3, "rows": 9,
-        "dataset": {"file": "scenes.hdf5", "rows_sha256": "c" * 64}, "settings": {},
-        "sets": {"p": {"measures": {"headline": {"value": 0.256, "low": 0.1, "high": 0.4}}}},
-        "warnings": ["few objects"],
-    }  # fmt: skip
-    text = card_text("p", checkpoint, [score], "cc-by-4.0")
-    assert "| p | 25.6 | 10.0 to 40.0 |" in text and "> few objects" in text
-    assert "12 numbers" in text and "Epoch 1 of 2 is kept: loss 1.000" in text

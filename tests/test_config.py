@@ -13,12 +13,7 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from drakegrasp.config import (
-    Config,
-    apply_override,
-    parse_config,
-    with_whole_lifts,
-)
+from drakegrasp.config import Config, apply_override, parse_config, with_whole_lifts
 from drakegrasp.errors import ConfigError, DrakegraspError
 from drakegrasp.hand.settings import load_config, override_config
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations, product
-
 import numpy as np
 import pytest
 
@@ -89,25 +87,12 @@ def test_cover_is_that_of_comparing_all_pairs() -> None:
 
 
 def test_cells_are_the_vertices_of_an_icosahedron_that_is_subdivided_once() -> None:
-    golden = (1.0 + np.sqrt(5.0)) / 2.0
-    corners = {
-        tuple(np.roll([0.0, a, b * golden], k).round(9))
-        for a, b, k in product((1, -1), (1, -1), range(3))
-    }
-    # Corners of one triangle are at distance two.
-    near = [
-        (a, b)
-        for a, b in combinations(sorted(corners), 2)
-        if np.isclose(np.linalg.norm(np.subtract(a, b)), 2.0)
-    ]
-    middles = {tuple((np.array(a) + b) / 2) for a, b in near}
-    assert (len(corners), len(middles)) == (12, 30)
-    expected = np.array([v / np.linalg.norm(v) for v in map(np.array, [*corners, *middles])])
-    found = cell_directions()
+    """Twelve corners, and the middles of the thirty edges, each of which is next to two corners."""
+    found, golden = cell_directions(), (1.0 + np.sqrt(5.0)) / 2.0
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, rtol=1e-15)
-    nearest = (found @ expected.T).argmax(axis=1)
-    assert sorted(nearest.tolist()) == list(range(42))
-    np.testing.assert_allclose(found, expected[nearest], atol=1e-12)
+    next_to = np.isclose(found @ found.T, golden / np.hypot(1.0, golden))
+    assert sorted(next_to.sum(axis=1)) == [2] * 30 + [5] * 12
+    assert (found @ [0.0, 1.0, golden] / np.hypot(1.0, golden)).max() == pytest.approx(1.0)
 
 
 def test_a_palm_is_in_the_cell_of_the_nearest_direction() -> None:

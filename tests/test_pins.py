@@ -44,12 +44,6 @@ def test_near_numbers_are_the_same_and_exact_ones_are_not() -> None:
     assert pins.far(other, expected) == ["differs: seed", "differs: slip"]
 
 
-def test_values_come_back(tmp_path: Path) -> None:
-    found = {"a/b": np.arange(3.0), "c": np.asarray(2.5), "d": np.asarray("word")}
-    pins.write_values(tmp_path / "values.npz", found)
-    assert pins.far(pins.read_values(tmp_path / "values.npz"), found) == []
-
-
 def test_json_is_pinned_without_what_the_machine_says() -> None:
     told = json.loads('{"a": [1, null], "versions": {"x": "1"}, "seconds": 2.0, "b": {"c": "d"}}')
     found = {name: value.item() for name, value in pins.leaves(told, "card").items()}

@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import yaml
 from helpers.golden import Golden, points, short
@@ -21,9 +20,7 @@ from drakegrasp.hand.file_format import MODELS, hand_names
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand_setup import GRASPS, check_grasp, check_hand, trial_grasps
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.scene import hand_positions
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.verification.wrist_problem import hand_constants
 
 
@@ -263,26 +260,6 @@ def test_two_motors_that_push_against_each_other_hold_nothing_along_their_line(
     assert level.ok, level.text
     assert not upright.ok, upright.text
     assert "two motors that push against each other do not hold along their line" in upright.text
-
-
-@pytest.mark.sim
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["allegro", "franka", in_second_tier("leap")])
-@pytest.mark.parametrize("drive", ["worm", in_second_tier("locked")])
-def test_a_pinched_box_slips_by_less_than_a_millimetre(name: str, drive: str) -> None:
-    """Within the payload; joints of the preshape keep their positions."""
-    hand, config = load_hand(name), load_config(overrides=[f"lift.drive={drive}"])
-    model, X_TO, pregrasp, _ = next(trial_grasps(hand, "box"))
-    assert model.mass <= hand.payload
-    scene = build_scene(model, config.physics, hand)
-    record = run_attempt(scene, X_TO, pregrasp, config)
-    assert record.outcome is Outcome.SUCCESS
-    assert record.closed.contacts.touching.all()
-    assert record.lift.slip < 1e-3
-    assert record.lift.turn < np.deg2rad(1.0)
-    q = dict(zip(hand.joint_names, hand_positions(scene), strict=True))
-    for joint, position in hand.preshape.items():
-        assert q[joint] == position
 
 
 @pytest.mark.sim

@@ -23,7 +23,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drakegrasp.errors import HandError
 from drakegrasp.hand.checks import overlap_query
 from drakegrasp.hand.description import SLIDE, Hand, load_hand
-from drakegrasp.hand.file_format import MODELS, Coupling
+from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import (
     closing_levers,
@@ -57,17 +57,6 @@ def test_masses_are_the_published_ones(hand: Hand) -> None:
     masses = declared_masses(read_xml(hand.model.path))
     assert masses == {name: LINKS[link_kind(name)][0] for name in masses}
     assert sum(masses.values()) == pytest.approx(1.2022, abs=1e-4)
-
-
-@pytest.mark.parametrize("path", sorted(MODELS.glob("barrett_*.obj")), ids=lambda p: p.stem)
-def test_parts_are_closed_convex_and_wound_outwards_with_normals(path: Path) -> None:
-    mesh = trimesh.load(path, process=False)
-    assert "vertex_normals" in mesh._cache  # read from the file, not computed
-    mesh.merge_vertices(merge_norm=True)
-    assert mesh.is_watertight
-    assert mesh.is_winding_consistent
-    assert mesh.is_convex
-    assert mesh.volume == pytest.approx(mesh.convex_hull.volume, rel=1e-6)
 
 
 def test_collision_shapes_fill_the_cad_bounding_boxes(hand: Hand) -> None:
@@ -128,15 +117,6 @@ def test_joints_of_the_fingers_can_have_motors_of_their_own(name: str, joints: l
     assert list(motors) == joints
     fingers = len(load_hand(name).fingers)
     assert list(motors.values()) == sorted([*range(fingers)] * (len(joints) // fingers))
-
-
-def test_a_coupling_that_stops_first_limits_its_finger(tmp_path: Path) -> None:
-    coupled = [{"joint": "right_hinge", "ratio": -2.0}]
-    fingers = changed_finger(coupled=coupled)[:1]
-    pincer = load_hand(write_pincer(tmp_path, fingers=fingers))
-    assert pincer.fingers[0].coupled == (Coupling(joint="right_hinge", ratio=-2.0),)
-    # right_hinge, 0..1, turns by -2 times the closing angle, -0.1..1.
-    np.testing.assert_allclose(coordinate_limits(pincer)[1], [-0.1, 0.0])
 
 
 def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
@@ -307,12 +287,13 @@ def test_a_preshape_fixes_joints_at_their_positions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(chain.offset, [0.3])
 
 
-def test_a_coupling_may_start_at_another_position(tmp_path: Path) -> None:
-    """The right hinge, 0..1, stands at 0.8 - 2 c."""
-    coupled = [{"joint": "right_hinge", "ratio": -2.0, "offset": 0.8}]
+@pytest.mark.parametrize("offset", [0.0, 0.8])
+def test_a_coupling_that_stops_first_limits_its_finger(tmp_path: Path, offset: float) -> None:
+    """The right hinge, 0..1, stands at offset - 2 c, where c is -0.1..1."""
+    coupled = [{"joint": "right_hinge", "ratio": -2.0, "offset": offset}]
     hand = load_hand(write_pincer(tmp_path, fingers=changed_finger(coupled=coupled)[:1]))
-    assert joint_positions(hand, 0.0, [0.1])["right_hinge"] == pytest.approx(0.6)
-    np.testing.assert_allclose(coordinate_limits(hand)[1], [-0.1, 0.4])
+    assert joint_positions(hand, 0.0, [0.1])["right_hinge"] == pytest.approx(offset - 0.2)
+    np.testing.assert_allclose(coordinate_limits(hand)[1], [-0.1, offset / 2.0])
 
 
 def test_fingers_slide(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from drakegrasp.config import CarriedHand, Config
 from drakegrasp.errors import DiskFullError, HandError
 from drakegrasp.hand import folder as carrying
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.folder import carry_hand, hand_digest, hand_folder
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
@@ -86,17 +85,6 @@ def test_a_hand_of_several_folders_is_refused(model: str, mesh: str, tmp_path: P
     change(path, MODEL, f"model: {model.format(tmp_path)}")
     with pytest.raises(HandError, match=r"must name files in it only, got .*: copy the files into"):
         load_hand(path)
-
-
-def test_files_below_the_hand_file_keep_their_bytes(tmp_path: Path) -> None:
-    folder = hand_folder("barrett")
-    for place in folder.files:
-        assert folder.content(place) == (MODELS / place).read_bytes()
-    assert not folder.licences
-    path = write_tongs(tmp_path)
-    copy = carried_source(tmp_path / "out", load_config(hand=str(path)))
-    for name in ("tongs.urdf", "tongs_hand.yaml"):
-        assert (copy.path.parent / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
 def test_materials_textures_and_licences_come_along(tmp_path: Path) -> None:

@@ -129,14 +129,6 @@ def test_no_fingertip_of_weaker_motors_carries_more_than_the_load():
         assert within_load(hand, load) is hand
 
 
-def test_strength_at_the_ends_of_the_range_is_what_the_docs_say():
-    hand = load_hand()
-    ends = [closing_levers(hand, limit) for limit in coordinate_limits(hand)[1:].T]
-    middle = np.array([2.0, 2.0, 4.0]) / fingertip_forces(hand, "torque")
-    assert np.allclose(middle / ends[0] - 1.0, -0.10, atol=0.005)
-    assert np.allclose(middle / ends[1] - 1.0, 0.19, atol=0.005)
-
-
 def test_locked_finger_without_a_holding_torque_holds_what_the_others_press(tmp_path):
     hand = load_hand(write_pincer(tmp_path, fingers=changed_finger(torque_limit=3.0)))
     assert np.allclose(fingertip_forces(hand, "locked"), [3.0 / ARM, 3.0 / ARM])

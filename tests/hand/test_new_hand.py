@@ -41,24 +41,6 @@ def pads(hand: Hand, share: float) -> np.ndarray:
     return pad_points_at(hand, share * closed_positions(hand))
 
 
-@pytest.mark.parametrize(("text", "name"), [(JAWS, "jaws.urdf"), (JAWS_MJCF, "jaws.xml")])
-def test_jaws_that_open_at_positive_positions_are_turned_round(
-    tmp_path: Path, text: str, name: str
-) -> None:
-    drafted = draft(tmp_path, text, name)
-    assert [finding.text for finding in drafted.findings if not finding.ok] == []
-    hand = load_hand(drafted.path)
-    assert hand.palm_link == "body"
-    np.testing.assert_allclose(hand.X_BG[:3, 2], [0.0, 0.0, 1.0], atol=1e-9)
-    # 100 mm apart at zero, closed at the limit; the pads are at the ends of the jaws.
-    gaps = [np.linalg.norm(np.diff(pads(hand, share), axis=0)) for share in (0.0, 1.0)]
-    np.testing.assert_allclose(gaps, [0.1, 0.0], atol=1e-6)
-    assert all(p[2] > 0.04 for p in pads(hand, 0.5))
-    # One motor moves both jaws with 60 N each.
-    driver, driven = hand.fingers
-    assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
-
-
 def test_a_hand_of_four_fingers_grasps_with_three(tmp_path: Path) -> None:
     ring = MITTEN[MITTEN.index('<link name="index') : MITTEN.index('<link name="middle')]
     ring = ring.replace("index", "ring").replace("0 0.022 0", "0 0 0")

@@ -19,7 +19,6 @@ from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import TrialSetup, trial_rows
-from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
@@ -125,13 +124,6 @@ def test_a_posture_is_not_stored_as_of_the_first_preshape(
     record = TrialRecord(outcome=Outcome.START_COLLISION, X_TO=X, X_OG=X)
     rows = trial_rows(setup, [posture, drawn], [record] * 2)
     assert rows["preshape"].tolist() == [none, 0]
-
-
-def test_bits_say_which_fingers_are_left_out() -> None:
-    np.testing.assert_array_equal(
-        unused_fingers([0, 1, 6], 3),
-        [[False, False, False], [True, False, False], [False, True, True]],
-    )
 
 
 def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:

@@ -9,7 +9,7 @@ from helpers.hands import drake_fingertip_poses
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import hand_names
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_forces, fingertip_poses
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 
 #: Centres of the round tips in the fingertip links [m]; SimLab's URDF.
 ALLEGRO_TIPS = np.array([[0.0, 0.0, 0.0267], [0.0, 0.0, 0.0267], [0.0, 0.0, 0.0423]])
@@ -65,17 +65,6 @@ def test_a_hand_is_where_its_joint_table_puts_it(name: str, p_FP: Array, row: st
     np.testing.assert_allclose(1e3 * points(X_GF, p_FP), np.reshape(numbers, (3, 3)), atol=0.1)
 
 
-def test_four_fingers_are_those_of_the_same_model() -> None:
-    """Index, middle and thumb are where they are with three, but for the palm frame's origin."""
-    three, four = load_hand("allegro"), load_hand("allegro_four")
-    assert four.model.path == three.model.path
-    X_GF = fingertip_poses(four, spread=0.0, closing=[0.5] * 4)[[0, 1, 3]]
-    X_GF[:, :3, 3] += (np.linalg.inv(three.X_BG) @ four.X_BG)[:3, 3]
-    np.testing.assert_allclose(
-        X_GF, fingertip_poses(three, spread=0.0, closing=[0.5] * 3), atol=1e-12
-    )
-
-
 @pytest.mark.parametrize(("closing", "y"), FRANKA)
 def test_franka_is_where_its_figures_put_it(closing: float, y: float) -> None:
     hand = load_hand("franka")
@@ -102,7 +91,3 @@ def test_limits_are_those_of_all_joints_that_a_finger_moves() -> None:
     limits = coordinate_limits(load_hand("allegro"))
     np.testing.assert_allclose(limits[:2], [[0.0, 0.0], [-0.196, 1.509]], atol=1e-12)
     np.testing.assert_array_equal(coordinate_limits(load_hand("franka"))[1:], [[0.0, 0.04]] * 2)
-
-
-def test_fingers_that_slide_press_with_half_of_their_motors_force() -> None:
-    np.testing.assert_allclose(fingertip_forces(load_hand("franka"), "torque"), [35.0, 35.0])

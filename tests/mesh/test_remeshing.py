@@ -20,13 +20,7 @@ from drakegrasp.errors import MeshError
 from drakegrasp.mesh import remeshing
 from drakegrasp.mesh.components import face_components, pair_half_edges
 from drakegrasp.mesh.remeshing import _decimate_parted, coarsen, decimate, resting_hull, subdivide
-from drakegrasp.mesh.surfaces import (
-    Solid,
-    face_areas,
-    half_edges,
-    is_solid_surface,
-    signed_volume,
-)
+from drakegrasp.mesh.surfaces import Solid, face_areas, half_edges, is_solid_surface, signed_volume
 
 
 def test_decimation_keeps_the_solid(tmp_path):

@@ -6,34 +6,19 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.mesh_files import load_mesh
-from helpers.meshes import (
-    BOX,
-    G3DB,
-    assert_sound,
-    box,
-    flipped,
-    needs_g3db,
-    open_box,
-    prepare,
-    without_faces,
-    write,
-)
+from helpers.meshes import BOX, assert_sound, box, flipped, open_box, prepare, without_faces, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import drakegrasp.mesh.components
 import drakegrasp.mesh.repair
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.components import part_touching_edges
-from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     is_solid_surface,
     signed_volume,
     whole_windings,
     winding_numbers,
 )
-from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.sources import find_meshes
 
 VOLUME = float(np.prod(BOX))
 
@@ -183,34 +168,6 @@ def test_surface_of_too_many_pieces_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(drakegrasp.mesh.repair, "MOST_PIECES", 3)
     with pytest.raises(MeshError, match="must be of at most 3 pieces, got 4: keep the large ones"):
         prepare(path)
-
-
-@needs_g3db
-def test_surface_that_passes_through_itself_too_much_is_refused(monkeypatch):
-    monkeypatch.setattr(drakegrasp.mesh.components, "MAX_OVERLAP", 0.02)
-    (source,) = (s for s in find_meshes(G3DB, units="cm") if "toaster" in s.name)
-    with pytest.raises(MeshError, match="must not pass through itself"):
-        prepare_object(source)
-
-
-def test_signed_volume_does_not_depend_on_the_place():
-    cube = box(at=(100.0, -50.0, 7.0))
-    volume = signed_volume(np.array(cube.vertices), np.array(cube.faces))
-    assert volume == pytest.approx(np.prod(BOX), rel=1e-9)
-
-
-def test_touching_edge_gets_a_vertex_for_each_side():
-    """Two bricks share an edge; each keeps its own two faces at both halves of it."""
-    corner, other = box((0.02,) * 3), box((0.02,) * 3, (0.02, 0.02, 0.0))
-    vertices, faces = weld(
-        np.vstack((corner.vertices, other.vertices)), np.vstack((corner.faces, other.faces + 8))
-    )
-    assert not is_solid_surface(faces)
-    parted, new_faces = part_touching_edges(vertices, faces)
-    assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
-    np.testing.assert_allclose(parted[-2:], [[0.01, 0.01, 0.0]] * 2, atol=1e-12)
-    assert is_solid_surface(new_faces)
-    assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
 
 
 def test_triangle_that_is_a_needle_is_collapsed_and_told():

@@ -19,7 +19,6 @@ from drakegrasp.config import BuiltinConfig
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.surfaces import overlap_share
 from drakegrasp.seeding import Stream
-from drakegrasp.shapes import kitchen
 from drakegrasp.shapes.catalog import (
     CLASSES,
     BuiltinObject,
@@ -134,51 +133,6 @@ def test_as_many_of_each_class_as_asked_for() -> None:
     assert set(counts.values()) == {3} and len(counts) == 64
     assert [item.name for item in drawn[:4]] == ["1_mug_1", "1_mug_2", "1_mug_3", "2_bottle_1"]
     assert {item.seed for item in drawn} == {5}
-
-
-def test_box_and_can_have_their_volume() -> None:
-    mesh = kitchen.box(width=0.1, depth=0.07, height=0.06)
-    assert mesh.volume == pytest.approx(0.1 * 0.07 * 0.06, rel=1e-6)
-    np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.035, 0.0], [0.05, 0.035, 0.06]], atol=1e-7)
-    mesh = kitchen.can(radius=0.033, height=0.12)
-    assert mesh.volume == pytest.approx(np.pi * 0.033**2 * 0.12, rel=0.02)
-
-
-def test_mug_is_a_shell_with_a_handle() -> None:
-    radius, height, wall, floor = 0.044, 0.1, 0.005, 0.007
-    mesh = kitchen.mug(radius=radius, height=height, handle_reach=0.034, handle_radius=0.006)
-    shell = np.pi * (radius**2 * height - (radius - wall) ** 2 * (height - floor))
-    # The handle: an ellipse of 0.006 x 0.0078 along half an ellipse from wall to wall.
-    a, b = 0.034 - 0.006, 0.32 * height
-    handle = np.pi * 0.006 * 0.0078 * np.pi * np.sqrt((a**2 + b**2) / 2.0)
-    assert mesh.volume == pytest.approx(shell + handle, rel=0.05)
-    assert mesh.extents == pytest.approx([2 * radius + 0.034, 2 * radius, height], abs=5e-4)
-    assert mesh.euler_number == 0
-
-
-@pytest.mark.parametrize(
-    "name", ["mug", "cup", "bowl", "vase", "wineglass", "pitcher", "saucepan", "bucket", "trophy"]
-)
-def test_vessel_is_hollow_and_thick_enough(name: str, which: str) -> None:
-    (found,) = (item for item in CLASSES if item.name == name)
-    mesh = build(found, which)
-    # A bucket's bail and a rim with nothing above it end at different heights.
-    height = mesh.bounds[1, 2] * (0.55 if name == "bucket" else 1.0)
-    axis = np.array([[0.0, 0.0, 0.80 * height], [0.0, 0.0, 0.97 * height]])
-    assert not mesh.contains(axis).any()
-    assert mesh.contains([[0.0, 0.0, 0.003]]).all()
-    # Along +y, away from handle and lip, a ray goes once in and once out of the wall.
-    at = np.array([[0.0, 0.0, 0.80 * height]])
-    hits, _, _ = mesh.ray.intersects_location(at, [[0.0013, 1.0, 0.0]])
-    inner, outer = np.sort(hits[:, 1])
-    assert outer - inner > 0.0038
-
-
-def test_funnel_is_open_at_both_ends() -> None:
-    mesh = builtin_object("14_funnel_1").build()
-    axis = np.column_stack([np.zeros((20, 2)), np.linspace(-0.01, 0.2, 20)])
-    assert not mesh.contains(axis).any()
-    assert mesh.euler_number == 0
 
 
 def test_seam_that_rounding_opens_is_closed() -> None:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from helpers.objects import model_of
 from scipy.spatial import cKDTree
 
 from drakegrasp.config import Config
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.objects.model import ObjectModel, prepare_object
-from drakegrasp.objects.sources import MeshSource
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.candidates import (
@@ -23,7 +22,6 @@ from drakegrasp.simulation.candidates import (
     Drawing,
     palm_attempts,
     palm_ray_distance,
-    ray_meets_box,
     rotation_candidates,
 )
 
@@ -49,15 +47,6 @@ COARSE = DEFAULTS.model_copy(
         "local_z_deg": (0, 45, 180),
     }
 )
-
-
-class Reference(NamedTuple):
-    """Our poses of a box beside all valid ones, found by brute force."""
-
-    name: str
-    half: Array
-    poses: Array
-    every_valid: Array
 
 
 def standing(half: Array) -> Array:
@@ -121,26 +110,13 @@ def coordinates(R: Array, p: Array, half: Array) -> Array:
     return np.hstack([R.reshape(-1, 9), p / np.linalg.norm(half)])
 
 
-@pytest.fixture(scope="module", params=BOXES)
-def reference(request: pytest.FixtureRequest) -> Reference:
-    half = np.array(BOXES[request.param][0]) / 2.0
-    poses = rotation_candidates(half, standing(half), DEFAULTS, Stream(0))
-    return Reference(request.param, half, poses, coordinates(*every_valid_pose(half), half))
+def model(folder: Path, name: str) -> ObjectModel:
+    return model_of(trimesh.creation.box((0.06, 0.08, 0.10)), folder, name)
 
 
 @pytest.fixture(scope="module")
-def make_object(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., ObjectModel]:
-    def make(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
-        path = tmp_path_factory.mktemp("mesh") / f"{name}.stl"
-        mesh.export(path)
-        return prepare_object(MeshSource(name=name, class_name=name, path=path))
-
-    return make
-
-
-@pytest.fixture(scope="module")
-def box(make_object: Callable[..., ObjectModel]) -> ObjectModel:
-    return make_object(trimesh.creation.box((0.06, 0.08, 0.10)), "box")
+def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return model(tmp_path_factory.mktemp("mesh"), "box")
 
 
 BOX_X_TO = make_pose(np.eye(3), [0.0, 0.0, 0.05])
@@ -152,50 +128,28 @@ def coarse(**changed: object) -> Config:
     return load_config().model_copy(update={"candidates": rules})
 
 
-def test_poses_are_the_distinct_ones_of_all_that_a_brute_force_finds(reference: Reference) -> None:
+@pytest.mark.parametrize(("extents", "valid", "distinct"), BOXES.values(), ids=BOXES)
+def test_poses_are_the_distinct_ones_of_all_that_a_brute_force_finds(
+    extents: tuple[float, ...], valid: int, distinct: int
+) -> None:
     """No ray grazes the box, so that the count does not hang on rounding. No pose comes twice."""
-    _, valid, distinct = BOXES[reference.name]
-    assert len(reference.every_valid) == valid
+    half = np.array(extents) / 2.0
+    every_valid = coordinates(*every_valid_pose(half), half)
+    assert len(every_valid) == valid
     for scale in (1.0 - 1e-7, 1.0 + 1e-7):
-        assert len(every_valid_pose(reference.half, scale)[0]) == valid
-    ours = coordinates(reference.poses[:, :3, :3], reference.poses[:, :3, 3], reference.half)
-    tree = cKDTree(ours)
+        assert len(every_valid_pose(half, scale)[0]) == valid
+    poses = rotation_candidates(half, standing(half), DEFAULTS, Stream(0))
+    tree = cKDTree(ours := coordinates(poses[:, :3, :3], poses[:, :3, 3], half))
     assert not tree.query_pairs(1e-6)
-    nearest, index = tree.query(reference.every_valid)
+    nearest, index = tree.query(every_valid)
     assert nearest.max() < 1e-9
     assert len(np.unique(index)) == len(ours) == distinct
 
 
-@pytest.mark.parametrize(
-    ("p", "z", "meets"),
-    [
-        ((0, 0, 2), (0, 0, -1), True),
-        ((0, 0, 2), (0, 0, 1), False),  # behind
-        ((1.001, 0, 2), (0, 0, -1), False),
-        ((0.999, -0.999, 2), (0, 0, -1), True),
-        ((0, 0, 0), (1, 0, 0), True),  # from inside
-        ((0, 0, 2), (1e-17, -1e-17, -1), True),  # a zero with noise
-        ((2, 0, 2), (-1, 0, -1), True),
-        # Within a face: 0/0 in a slab constrains nothing.
-        ((1, 0, 2), (0, 0, -1), True),
-        ((-1, 0, 2), (0, 0, -1), True),
-        ((1, 1, 2), (0, 0, -1), True),
-        ((0, -1, 2), (0, 0, -1), True),
-    ],
-)
-def test_ray_and_unit_box_in_the_cases_that_divide_by_zero(
-    p: tuple[float, ...], z: tuple[float, ...], meets: bool
-) -> None:
-    direction = np.array([z], dtype=float)
-    assert ray_meets_box(np.array([p], dtype=float), direction, np.ones(3)).tolist() == [meets]
-
-
 @pytest.mark.parametrize("method", ["rotations", "normals"])
-def test_seed_and_name_decide_the_draw(
-    box: ObjectModel, make_object: Callable[..., ObjectModel], method: str
-) -> None:
+def test_seed_and_name_decide_the_draw(box: ObjectModel, tmp_path: Path, method: str) -> None:
     config = coarse(method=(method,), max=50)
-    namesake = make_object(trimesh.creation.box((0.06, 0.08, 0.10)), "another_box")
+    namesake = model(tmp_path, "another_box")
     first, again = (Drawing(box, BOX_X_TO, config).candidates() for _ in range(2))
     np.testing.assert_array_equal(first.X_OG, again.X_OG)
     np.testing.assert_array_equal(first.distance, again.distance)

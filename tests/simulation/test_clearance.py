@@ -7,6 +7,7 @@ than the kinematics of the package and the states that it looks at.
 from __future__ import annotations
 
 import pickle
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,13 @@ pytestmark = pytest.mark.sim
 SCRAPES, PASSES = 0.042, 0.044
 
 
-def record_heights(scene: Scene) -> list[tuple[float, float]]:
-    """Return a list that gets the time [s] and the hand's least height [m] after each step."""
-    inspector, noted = scene.scene_graph.model_inspector(), list[tuple[float, float]]()
+@pytest.fixture
+def noted(scene: Scene) -> Iterator[list[tuple[float, float]]]:
+    """A list that gets the time [s] and the hand's least height [m] after each step.
+
+    With worms the lift would take the place of the recorder.
+    """
+    inspector, seen = scene.scene_graph.model_inspector(), list[tuple[float, float]]()
     hulls = [
         (body, inspector.GetPoseInFrame(geometry), inspector.GetConvexHull(geometry))
         for body in scene.links
@@ -42,21 +47,18 @@ def record_heights(scene: Scene) -> list[tuple[float, float]]:
                 X_WS = scene.plant.EvalBodyPoseInWorld(context, body) @ X_BS
                 corners = [X_WS @ hull.vertex(i) for i in range(hull.num_vertices())]
                 lowest = min(lowest, np.array(corners)[:, 2].min())
-        noted.append((root.get_time(), lowest - X_WT[2, 3]))
+        seen.append((root.get_time(), lowest - X_WT[2, 3]))
 
     scene.simulator.set_monitor(note)
-    return noted
+    yield seen
+    scene.simulator.clear_monitor()
 
 
 @pytest.mark.parametrize("standoff", [SCRAPES, PASSES])
-def test_clearance_is_the_least_of_all_steps(scene, cube, config, standoff) -> None:
-    # The whole way from the open hand; with worms the lift would take the place of the recorder.
+def test_clearance_is_the_least_of_all_steps(scene, cube, config, noted, standoff) -> None:
+    # The whole way from the open hand.
     rules = override_config(config, ["screen.mode=off", "lift.drive=torque"])
-    noted = record_heights(scene)
-    try:
-        record = run_attempt(scene, standing(cube), from_above(cube, standoff), rules)
-    finally:
-        scene.simulator.clear_monitor()
+    record = run_attempt(scene, standing(cube), from_above(cube, standoff), rules)
     closing = [height for time, height in noted if time <= record.closed.duration]
     assert record.closed.clearance == pytest.approx(min(closing), abs=1e-4)
     # What geometry skips counts.
@@ -64,7 +66,7 @@ def test_clearance_is_the_least_of_all_steps(scene, cube, config, standoff) -> N
     assert quick.closed.clearance == pytest.approx(min(closing), abs=1e-4)
 
 
-def test_lift_begins_where_closing_ended(scene, cube, config, monkeypatch) -> None:
+def test_lift_begins_where_closing_ended(scene, cube, config, noted, monkeypatch) -> None:
     looks = list[float]()
 
     class Noted(ClearanceMonitor):
@@ -74,11 +76,7 @@ def test_lift_begins_where_closing_ended(scene, cube, config, monkeypatch) -> No
 
     monkeypatch.setattr("drakegrasp.simulation.lift.ClearanceMonitor", Noted)
     rules = override_config(config, ["lift.drive=torque"])
-    noted = record_heights(scene)
-    try:
-        record = run_attempt(scene, standing(cube), from_above(cube, PASSES), rules)
-    finally:
-        scene.simulator.clear_monitor()
+    record = run_attempt(scene, standing(cube), from_above(cube, PASSES), rules)
     assert looks[0] == pytest.approx(record.closed.duration)
     lifting = [height for time, height in noted if time >= record.closed.duration - 1e-9]
     assert record.lift.clearance == pytest.approx(min(lifting), abs=1e-4)

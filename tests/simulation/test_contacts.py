@@ -103,6 +103,13 @@ def test_patch_mostly_beside_the_pad_is_split(closed, scale):
     cosine = -(part.f_Q_O[0] * part.nhat_Q_O[0]).sum() / np.linalg.norm(part.f_Q_O[0])
     assert cosine > np.cos(np.arctan(0.71)) - 1e-3
 
+    # The rest counts by its own force: it carries what the pad does not.
+    rest = float(np.linalg.norm(whole.f_Q_O[0] - part.f_Q_O[0]))
+    for factor, count in ((0.99, 1), (1.01, 0)):
+        physics = closed.physics.model_copy(update={"contact_force": factor * rest})
+        strict = replace(closed, physics=physics)
+        assert with_pads(strict, (beyond,), EVERYWHERE, EVERYWHERE).other_links == count
+
 
 def _contact_in_link(scene: Scene, contacts: Contacts) -> float:
     """Return how far along its link finger 1 touches [m]."""
@@ -215,19 +222,6 @@ def test_point_contacts_are_counted(closed: Scene) -> None:
         reader.add_point_pair(pair)
         found = reader.contacts()
         assert (found.point_contacts, found.hand_on_table) == (count, on_table)
-
-
-def test_rest_of_a_split_patch_counts_by_its_own_force(closed: Scene) -> None:
-    """It carries what the pad does not."""
-    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
-    x = _contact_in_link(closed, whole)
-    beyond = (1.0, 0.0, 0.0, x + PAD_BAND + 1e-3)
-    part = with_pads(closed, (beyond,), EVERYWHERE, EVERYWHERE)
-    rest = float(np.linalg.norm(whole.f_Q_O[0] - part.f_Q_O[0]))
-    for factor, count in ((0.99, 1), (1.01, 0)):
-        physics = closed.physics.model_copy(update={"contact_force": factor * rest})
-        strict = replace(closed, physics=physics)
-        assert with_pads(strict, (beyond,), EVERYWHERE, EVERYWHERE).other_links == count
 
 
 def test_palm_on_the_object_is_another_link(scene: Scene, cube: ObjectModel) -> None:

@@ -24,13 +24,7 @@ from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.attempt import usual_materials
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.drive import (
-    disengage,
-    drive_of,
-    engage,
-    hand_over,
-    opening_torques,
-)
+from drakegrasp.simulation.drive import disengage, drive_of, engage, hand_over, opening_torques
 from drakegrasp.simulation.scene import (
     Scene,
     TrialTimeout,
@@ -83,34 +77,32 @@ def test_pinched_carton_stays_where_it_is_unless_fingers_are_pushed_open(
 
 
 @pytest.mark.sim
-@pytest.mark.parametrize("coarse", [False, True])
-def test_worm_lets_no_finger_open(
-    scene: Scene, cube: ObjectModel, config: Config, coarse: bool
+@pytest.mark.parametrize(
+    ("drive", "force", "steps"),
+    [
+        ("worm", 1.0, 20),
+        ("worm in coarse steps", 1.0, 20),
+        ("torque", 1.0, 40),
+        ("locked", 5.0, 20),
+    ],
+)
+def test_worm_lets_no_finger_open_and_a_lock_lets_none_move(
+    scene: Scene, cube: ObjectModel, config: Config, drive: str, force: float, steps: int
 ) -> None:
     """A force that the motors cannot hold, in steps of either kind and across their change."""
-    current = _closed_on(scene, cube)
-    engage(current, "worm")
+    current, (name, *coarse) = _closed_on(scene, cube), drive.split()
+    engage(current, name)
     if coarse:
         current = _continued_in_coarse_steps(scene, config)
 
-    angles = _pushed(current, FORCE, steps=20)
+    angles = _pushed(current, force * FORCE, steps=steps)
     loads = opening_torques(current)
     disengage(current)
-    torques = [finger.torque_limit for finger in current.hand.fingers]
-    assert np.any(loads > 1.2 * np.array(torques))
-    assert np.diff(angles, axis=0).min() > -STILL
-
-
-@pytest.mark.sim
-@pytest.mark.parametrize(("drive", "force", "steps"), [("torque", 1.0, 40), ("locked", 5.0, 20)])
-def test_force_opens_fingers_without_a_worm_unless_they_are_locked(
-    scene: Scene, cube: ObjectModel, drive: str, force: float, steps: int
-) -> None:
-    _closed_on(scene, cube)
-    engage(scene, drive)
-    angles = _pushed(scene, force * FORCE, steps=steps)
-    disengage(scene)
-    if drive == "torque":
+    if name == "worm":
+        torques = [finger.torque_limit for finger in current.hand.fingers]
+        assert np.any(loads > 1.2 * np.array(torques))
+        assert np.diff(angles, axis=0).min() > -STILL
+    elif name == "torque":
         assert (angles[-1] - angles[0]).min() < np.deg2rad(-1.0)
     else:
         assert np.abs(angles - angles[0]).max() < STILL

@@ -15,10 +15,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.errors import GraspError, MeshError
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.settings import load_config
-from drakegrasp.simulation.placement import (
-    canonical_pose,
-    place_object,
-)
+from drakegrasp.simulation.placement import canonical_pose, place_object
 from drakegrasp.simulation.settle import settle
 
 EXTENTS = np.array([0.06, 0.08, 0.1])

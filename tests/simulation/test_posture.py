@@ -20,18 +20,8 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempts import make_posture
 from drakegrasp.simulation.drive import disengage, engage
 from drakegrasp.simulation.placement import PlacedObject, run_trial
-from drakegrasp.simulation.posture import (
-    OPENED,
-    Posture,
-    opened,
-    start_of,
-)
-from drakegrasp.simulation.scene import (
-    closing_angles,
-    command_joints,
-    joint_limits,
-    reset_attempt,
-)
+from drakegrasp.simulation.posture import OPENED, Posture, opened, start_of
+from drakegrasp.simulation.scene import closing_angles, command_joints, joint_limits, reset_attempt
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: A pose that no frame has.

@@ -11,12 +11,7 @@ from drakegrasp.config import CameraConfig, Config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.scene_cache import (
-    cached_renderer,
-    cached_scene,
-    forget_scenes,
-    run_in,
-)
+from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes, run_in
 from drakegrasp.simulation.trial import TrialRecord
 
 pytestmark = pytest.mark.sim

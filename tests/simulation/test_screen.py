@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.hands import slider_fingers, write_slider
-from helpers.objects import (
-    STANDOFF,
-    box_model,
-    drawn_attempts,
-    from_above,
-    model_of,
-    standing,
-)
+from helpers.objects import STANDOFF, box_model, drawn_attempts, from_above, model_of, standing
 
 from drakegrasp.config import ScreenConfig
 from drakegrasp.frames import make_pose

@@ -56,7 +56,9 @@ def test_fingers_close_at_their_speed(shipped: Scene) -> None:
 
 
 def test_coupled_joints_are_where_the_hand_file_has_them(shipped: Scene) -> None:
+    """And those of the preshape, to the bit."""
     q = dict(zip(hand_joint_names(shipped), hand_positions(shipped), strict=True))
+    assert {joint: q[joint] for joint in shipped.hand.preshape} == dict(shipped.hand.preshape)
     for finger in shipped.hand.fingers:
         for coupling in finger.coupled:
             expected = coupling.ratio * q[finger.closing_joint] + coupling.offset

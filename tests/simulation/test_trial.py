@@ -27,10 +27,7 @@ from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation import scene as stepping
 from drakegrasp.simulation.attempt import Attempt
-from drakegrasp.simulation.construction import (
-    build_object_scene,
-    build_scene,
-)
+from drakegrasp.simulation.construction import build_object_scene, build_scene
 from drakegrasp.simulation.contacts import is_inside
 from drakegrasp.simulation.lift import lift_duration
 from drakegrasp.simulation.scene import (

@@ -29,28 +29,9 @@ def pot(tmp_path_factory):
     return model_of(mesh, tmp_path_factory.mktemp("pot"), "1_pot_a")
 
 
-def fit(model, p):
-    return fit_surface(model, p, np.tile([0.0, 0.0, 1.0], (len(p), 1)))
-
-
-def test_distances_from_a_box_are_those_of_the_formula(box):
-    half = EXTENTS / 2.0
-    p = np.array(
-        [[0.0, 0.0, half[2] + 0.01], half + np.array([3e-3, 4e-3, 0]), [0.0, 0.0, 0.0], half]
-    )
-    found = fit(box, p)
-    np.testing.assert_allclose(found.distance, [0.01, 0.005, half.min(), 0.0], atol=1e-9)
-
-
 def outward(model, p, n):
     """Return whether each normal points out of a face next to its point."""
     return [bool(cosine > 0.1) for cosine in fit_surface(model, p, n).agreement]
-
-
-def test_agreement_is_the_cosine_to_the_face(box):
-    p = np.tile([EXTENTS[0] / 2.0, 0.0, 0.0], (3, 1))
-    n = np.array([[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [-1.0, 0.0, 0.0]])
-    np.testing.assert_allclose(fit_surface(box, p, n).agreement, [1.0, 0.6, -1.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("axis", range(3))

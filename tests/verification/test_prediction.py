@@ -10,14 +10,7 @@ import pytest
 from helpers.assertions import refused
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.frames import (
-    GRASP_FRAMES,
-    X_WT,
-    invert_pose,
-    make_pose,
-    pack_pose,
-    read_pose,
-)
+from drakegrasp.frames import GRASP_FRAMES, X_WT, invert_pose, make_pose, pack_pose, read_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.placing import contacts_on_object

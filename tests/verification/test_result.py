@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.objects import standing
-from helpers.verdicts import (
-    asked_otherwise,
-    some_contacts,
-    some_trial,
-    some_try,
-    some_verdict,
-)
+from helpers.verdicts import asked_otherwise, some_contacts, some_trial, some_try, some_verdict
 
 from drakegrasp.filters import Removal
 from drakegrasp.hand.settings import load_config

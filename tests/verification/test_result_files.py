@@ -9,13 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from helpers.verdicts import (
-    asked_otherwise,
-    some_contacts,
-    some_trial,
-    some_try,
-    some_verdict,
-)
+from helpers.verdicts import asked_otherwise, some_contacts, some_trial, some_try, some_verdict
 
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
 from drakegrasp.errors import DataError

@@ -279,32 +279,21 @@ def test_two_contacts_leave_poses_that_collide_out(held, monkeypatch, fingers, e
     assert found.outcome is left[0]
 
 
-def test_number_of_threads_changes_no_bit(cube, grasp):
-    """Workers have one thread for linear algebra; a caller's own process has many."""
-    fits = []
-    for threads in (1, 4):
-        with threadpool_limits(threads):
-            found = verify(cube, *grasp)
-        assert found.fit is not None
-        fits.append(found.fit)
-    np.testing.assert_array_equal(fits[0].X_OG, fits[1].X_OG)
-    np.testing.assert_array_equal(fits[0].closing, fits[1].closing)
-
-
-def test_a_wrist_pose_alone_is_fitted_by_one_thread(cube, grasp, monkeypatch):
-    """Protocols of MuJoCo ask for it outside of a verification."""
-    fit_wrist, threads = verifying.fit_wrist, set[int]()
+def test_wrist_poses_are_fitted_by_one_thread(cube, grasp, monkeypatch):
+    """Else bits depend on their number; protocols of MuJoCo ask for one pose alone."""
+    fit_wrist, threads = verifying.fit_wrist, list[int]()
 
     def fit(*given, **named):
         blas = [each for each in threadpool_info() if each["user_api"] == "blas"]
-        threads.update(each["num_threads"] for each in blas)
+        threads.extend(each["num_threads"] for each in blas)
         return fit_wrist(*given, **named)
 
     monkeypatch.setattr(verifying, "fit_wrist", fit)
     (asked,) = place_on_object(dg.pack_grasp(*grasp), cube)
     with threadpool_limits(2):
         verifying.first_fit(asked)
-    assert threads == {1}
+        verify_placed(asked)
+    assert len(threads) >= 2 and set(threads) == {1}
 
 
 def _fail(scene):

@@ -13,7 +13,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.hand import shapes
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.parsing import add_model
-from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
+from drakegrasp.hand.shapes import hull_triangles, link_shapes
 from drakegrasp.verification.wrist_problem import (
     ROUNDING,
     make_pads,
@@ -81,36 +81,6 @@ def test_smooth_distance_is_over_the_planes_by_its_rounding_at_most(pads, hulls,
     np.testing.assert_array_equal((distance < 0.0)[clear], np.array(inside)[clear])
 
 
-def test_before_the_middle_of_a_face_the_distance_is_the_exact_one(pads, hulls):
-    box = whole_pads([trimesh.creation.box(2.0 * HALF).vertices])
-    for axis in range(3):
-        for height in (0.02, 0.003, 0.0, -0.001):
-            for side in (-1.0, 1.0):
-                p = np.zeros((1, 3))
-                p[0, axis] = side * (HALF[axis] + height)
-                contact = signed_distance(box, p)
-                # Five other faces at least 1 cm - 1 mm farther away: e^-12 each.
-                assert contact.distance[0] == pytest.approx(height, abs=1e-8)
-                np.testing.assert_allclose(contact.normal[0], side * np.eye(3)[axis], atol=1e-4)
-    # The same with padding: body 0 of three has fewer planes than the others.
-    p = np.tile([0.0, HALF[1] + 0.004, 0.0], (3, 1))
-    assert signed_distance(pads, p).distance[0] == pytest.approx(0.004, abs=1e-8)
-    assert not np.isfinite(pads.offsets[0]).all()
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_derivatives_are_those_of_finite_differences(pads, hulls, seed):
-    p, h = points_about(hulls, 100 + seed), 1e-6
-    contact = signed_distance(pads, p)
-    for axis in np.eye(3):
-        after, before = signed_distance(pads, p + h * axis), signed_distance(pads, p - h * axis)
-        slope = (after.distance - before.distance) / (2.0 * h)
-        np.testing.assert_allclose(contact.gradient @ axis, slope, atol=1e-6)
-        turn = (after.normal - before.normal) / (2.0 * h)
-        # A pad turns by at most about a radian per rounding, 1/m.
-        np.testing.assert_allclose(contact.normal_jacobian @ axis, turn, atol=1e-5 / ROUNDING)
-
-
 def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(pads):
     p = np.array([HALF, [0.03, 0.02, 0.04], [0.1, 0.0, 0.0]])
     contact = signed_distance(pads, p)
@@ -121,13 +91,6 @@ def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(p
     # At a box's corner three planes count alike.
     np.testing.assert_allclose(contact.normal[0], np.full(3, 3.0**-0.5), atol=1e-5)
     assert length[0] == pytest.approx(3.0**-0.5, abs=1e-5)
-
-
-def test_far_from_the_pad_nothing_overflows(pads):
-    for p in np.random.default_rng(0).normal(size=(5, 3, 3)):
-        contact = signed_distance(pads, 1e3 * p)
-        for values in (contact.distance, contact.normal, contact.gradient, contact.normal_jacobian):
-            assert np.isfinite(values).all()
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -190,29 +153,12 @@ def test_point_outside_the_region_is_told_by_how_much():
     assert not within.outside_gradient.any()
 
 
-def test_pads_of_the_barrett_hand_are_in_their_region():
-    hand = load_hand()
-    for finger, triangles in zip(hand.fingers, pad_surfaces(hand.model, hand.fingers), strict=True):
-        corners = triangles.reshape(-1, 3)
-        assert finger.on_pad(corners + 1e-9).all()
-        assert np.allclose(corners.min(axis=0)[:2], [0.018, -0.0035], atol=1e-4)
-        assert corners[:, 0].max() > 0.057
-
-
 # The shapes of links
 
 
 @pytest.fixture(scope="module")
 def hand():
     return load_hand()
-
-
-def test_barretts_pad_points_are_on_their_fingertips(hand):
-    """The median of contacts on a rounded pad is a little below its surface."""
-    corners = [np.concatenate(link_shapes(hand.model)[link]) for link in hand.fingertip_links]
-    p_FiP = np.array([finger.p_FiP for finger in hand.fingers])
-    off = np.linalg.norm(nearest_on_pads(whole_pads(corners), p_FiP) - p_FiP, axis=1)
-    assert off.max() < 2.5e-3
 
 
 def with_shape(folder, shape):

@@ -10,13 +10,9 @@ import pytest
 from helpers.hands import PINCER, write_pincer
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.frames import invert_pose, make_pose, rotate_vectors, transform_points
+from drakegrasp.frames import invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.kinematics import (
-    fingertip_poses,
-    link_poses,
-    still_links,
-)
+from drakegrasp.hand.kinematics import fingertip_poses, link_poses, still_links
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.verification.wrist_problem import (
     CLEARANCE_ROUNDING,
@@ -185,27 +181,6 @@ def test_slope_of_the_clearance_is_that_of_finite_differences(name, seed):
     problem, x = random_problem(name, seed)
     slope = differences(lambda x: evaluate(problem, x).clearance, x)
     np.testing.assert_allclose(evaluate(problem, x).clearance_jacobian, slope, atol=1e-6)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_where_the_object_is_does_not_matter(name, seed):
-    """Contacts, table and start, moved together, make the same problem."""
-    problem, x = random_problem(name, seed)
-    X_AO = random_pose(np.random.default_rng(1000 + seed))
-    up_A = X_AO[:3, :3] @ problem.up_O
-    moved = replace(
-        problem,
-        p_OQ=transform_points(X_AO, problem.p_OQ),
-        nhat_Q_O=rotate_vectors(X_AO, problem.nhat_Q_O),
-        up_O=up_A,
-        height=problem.height - float(up_A @ X_AO[:3, 3]),
-        X_OS=X_AO @ problem.X_OS,
-    )
-    here, there = evaluate(problem, x), evaluate(moved, x)
-    np.testing.assert_allclose(there.X_OG, X_AO @ here.X_OG, atol=1e-12)
-    np.testing.assert_allclose(there.residuals, here.residuals, atol=1e-11)
-    np.testing.assert_allclose(there.jacobian, here.jacobian, atol=1e-9)
-    np.testing.assert_allclose(there.clearance, here.clearance, atol=1e-12)
 
 
 def test_a_finger_closed_against_its_contact_leaves_little(name):
