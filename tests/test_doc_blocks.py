@@ -56,7 +56,7 @@ NOT_RUN = {
     "drakegrasp score ": "tries hundreds of grasps; tests/cli/test_score_command.py",
     "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
     "drakegrasp hand new ": "a model that may not be shipped; tests/hand/test_new_hand.py",
-    "drakegrasp hand check ": "tests/hand/test_tutorial_hand.py runs it",
+    "drakegrasp hand check ": "tests/hand/test_check_hand.py runs it",
     "drakegrasp export OUT POSES ": "wants the package of the page; tests/test_plugin.py",
     "drakegrasp verify FILE ": "wants a file of postures; tests/cli/test_verify_request.py",
     "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols",

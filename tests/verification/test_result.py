@@ -1,19 +1,26 @@
-"""What a verdict is called, and what is said of it."""
+"""What a verdict is called, what is said of it, and how it is written."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import trimesh
 from helpers.objects import standing
 from helpers.verdicts import asked_otherwise, some_contacts, some_trial, some_try, some_verdict
 
+from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
+from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
+from drakegrasp.frames import make_pose, pack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.files import validate_writable
+from drakegrasp.verification.result import json_line, write_results
 
 CONFIG = load_config()
 
@@ -106,3 +113,157 @@ def test_lifted_within_a_distance_follows_from_the_farthest_contact():
     far = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error + 0.002),))
     assert far.lifted and not far.matches
     assert "fingertip 3 is more than 20.0 mm from its point" in far.explain()
+
+
+RNG = np.random.default_rng(0)
+X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.1])
+HINT = "points in millimetres instead of metres"
+
+
+def contacts():
+    """Two fingertips touch, the second does not."""
+    touching = np.array([True, False, True])
+    return some_contacts(
+        touching=touching,
+        p_OQ=np.where(touching[:, None], RNG.normal(size=(3, 3)), np.nan),
+        nhat_Q_O=np.where(touching[:, None], [1.0, 0.0, 0.0], np.nan),
+        f_Q_O=RNG.normal(size=(3, 3)),
+        other_links=2,
+        object_on_table=True,
+        point_contacts=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def found():
+    """One of each kind: held by the hand, missed by the hand, and no grasp."""
+    box = trimesh.creation.box([0.06, 0.05, 0.12])
+    model = make_object(
+        box.vertices, box.faces, CONFIG.objects, name="чашка", class_name="cup", mesh_sha256=""
+    )
+    asked = some_verdict(
+        model,
+        config=CONFIG,
+        outcome=Outcome.INVALID,
+        reason="number 1 is nan, not finite",
+        p_OQ=RNG.normal(size=(3, 3)),
+        nhat_Q_O=np.tile([0.0, 0.0, 1.0], (3, 1)),
+        surface_distance=np.array([0.02, 0.0, 0.0]),
+        seconds={"surface": 0.001},
+    )
+    nothing = np.full((3, 3), np.nan)
+    invalid = replace(asked, p_OQ=nothing, nhat_Q_O=nothing, surface_distance=nothing[0])
+    trial = some_trial(
+        asked.placed.X_TO, contacts(), contacts(), outcome=Outcome.SUCCESS, slip=0.002, turn=0.01
+    )
+    missing = replace(trial, outcome=Outcome.MISSING_FINGERTIP, closed=None, lift=None)
+    no_contacts = np.full(3, np.nan)
+    missed = replace(
+        asked,
+        outcome=Outcome.MISSING_FINGERTIP,
+        margin=0.1,
+        told=(HINT,),
+        tries=(some_try(missing, contact_error=no_contacts, normal_error=no_contacts),),
+    )
+    held = replace(
+        asked_otherwise(asked, normalised=True, confidence=0.75, rank=2),
+        outcome=Outcome.SUCCESS,
+        reason="every fingertip holds it",
+        margin=0.1,
+        tries=(some_try(trial), some_try(missing)),
+    )
+    return [held, missed, invalid]
+
+
+def lines_of(found):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not strict JSON")
+
+    return [
+        json.loads(json_line(index, result), parse_constant=refuse)
+        for index, result in enumerate(found)
+    ]
+
+
+def test_a_line_says_all_of_a_grasp_in_strict_json(found):
+    lines = lines_of(found)
+    names = {field.name for field in VERIFICATION_FIELDS}
+    assert all(names < line.keys() for line in lines)
+    expected = {
+        "index": [0, 1, 2],
+        "outcome": ["success", "missing_fingertip", "invalid"],
+        "matches": [True, False, False],
+        "kept": [True, False, False],
+        "removal": ["kept", None, None],
+        "unjudged": [["not_seen", "flat_depth", "outlier"], [], []],
+        "outcomes": [["success", "missing_fingertip"], ["missing_fingertip"], []],
+        "confidence": [0.75, None, None],
+        "rank": [2, -1, -1],
+        "normalised": [True, False, False],
+        "hints": ["", HINT, ""],
+        "contact_error": [[0.001, 0.002, 0.003], [None, None, None], None],
+        "fit_residual": [[0.0, 0.001, 0.333333], [0.0, 0.001, 0.333333], None],
+        "epsilon": [0.1, 0.1, None],
+        "slip": [0.002, None, None],
+        "closed_other_links": [2, None, None],
+        "seconds": [{"surface": 0.001}] * 3,
+    }
+    for name, values in expected.items():
+        assert [line[name] for line in lines] == values, name
+    held, _, invalid = lines
+    assert held["object"] == "чашка" and held["X_OG"] == X_OG.tolist()
+    assert held["closed_p_OQ"][1] == [None, None, None]
+    assert invalid["p_OQ"] == [[None] * 3] * 3 and "not finite" in invalid["explain"]
+
+
+def test_every_field_is_written_and_reads_back(found, tmp_path):
+    write_results(found, tmp_path / "r.h5", CONFIG)
+    shape = sizes(fingers=3, joints=8, image=0)
+    with h5py.File(tmp_path / "r.h5") as file:
+        group = file["grasps"]
+        assert set(group) == {f.name for f in VERIFICATION_FIELDS}
+        for field in VERIFICATION_FIELDS:
+            dataset = group[field.name]
+            assert dataset.shape == (3, *field.row_shape(shape))
+            assert field.dtype == "str" or dataset.dtype == np.dtype(field.dtype)
+            assert dataset.attrs["unit"] == field.unit
+        columns = {name: dataset[:] for name, dataset in group.items()}
+        assert group["hints"].asstr()[:].tolist() == ["", HINT, ""]
+        assert group["object"].asstr()[0] == "чашка"
+        assert file.attrs["schema_version"] == SCHEMA_VERSION
+        assert {f"convention_{key}" for key in CONVENTIONS} <= set(file.attrs)
+        assert json.loads(file.attrs["config"]) == CONFIG.to_dict()
+        assert json.loads(file.attrs["versions"])["drake"]
+    assert columns["outcome"].tolist() == [0, 5, 17]
+    assert columns["lifted_any"].tolist() == [True, False, False]
+    assert columns["tries"].tolist() == [2, 1, 0]
+    assert columns["rank"].tolist() == [2, -1, -1]
+    assert columns["contact_error"][0].tolist() == [0.001, 0.002, 0.003]
+    for name in ("p_OQ", "nhat_Q_O", "surface_distance", "matches"):
+        assert np.array_equal(columns[name], [getattr(v, name) for v in found], equal_nan=True)
+    closed = found[0].trial.closed
+    assert np.array_equal(columns["X_OG"][0], pack_pose(X_OG))
+    assert np.array_equal(columns["closed_q"][0], closed.q)
+    assert np.array_equal(columns["closed_p_OQ"][0], closed.contacts.p_OQ, equal_nan=True)
+    assert columns["X_TO_lifted"][0, 11] == 0.5
+    for name in ("contact_error", "X_TO_lifted", "slip"):
+        assert np.isnan(columns[name][1:]).all()
+
+
+def test_equal_results_give_equal_bytes(found, tmp_path):
+    """Whatever the clock said while they were found."""
+    slower = [replace(v, seconds={"surface": 1.0, "fit": 2.0}) for v in found]
+    write_results(found, tmp_path / "a.h5", CONFIG)
+    write_results(slower, tmp_path / "b.h5", CONFIG)
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_place_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.h5").mkdir()
+    with pytest.raises(DataError, match="must be in a folder that can be written"):
+        validate_writable(tmp_path / "file" / "deep" / "run.h5")
+    with pytest.raises(DataError, match=r"folder\.h5: must be a file, got a folder"):
+        validate_writable(tmp_path / "folder.h5")
+    validate_writable(tmp_path / "new" / "deep" / "run.h5")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.h5"]
