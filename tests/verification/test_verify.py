@@ -18,6 +18,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.attempts import make_attempts
 from drakegrasp.simulation.candidates import R_OG0
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
@@ -99,6 +100,16 @@ def test_moving_object_and_grasp_together_changes_nothing(held, cube, grasp, whe
     assert found.outcome is held.outcome and found.num_tries == held.num_tries
     np.testing.assert_allclose(found.fit.X_OG, held.fit.X_OG, atol=1e-9)
     np.testing.assert_allclose(reached(found), reached(held), atol=1e-9)
+
+
+def test_postures_are_tried_where_their_rows_put_the_object(cube):
+    """Poses that differ by 4 mm are two, and equal ones are one object."""
+    higher = make_pose(np.eye(3), [0.0, 0.0, 0.004]) @ cube.X_TO
+    poses, palms = np.array([cube.X_TO, higher, higher]), np.tile(np.eye(4), (3, 1, 1))
+    table = make_attempts(HAND, ["1_cube_a"] * 3, palms, X_TO=poses)
+    (low,), (high,), (again,) = (each.stands for each in place_on_object(table, cube))
+    assert low is cube and again is high
+    np.testing.assert_allclose(high.X_TO, higher, atol=1e-12)
 
 
 def test_contacts_in_the_air_are_tried_and_told(cube, grasp):
