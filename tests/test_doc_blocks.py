@@ -17,6 +17,7 @@ import yaml
 from helpers.commands import run
 from helpers.datasets import BOXES
 from helpers.meshes import write_fixed
+from helpers.tables import table
 from helpers.tiers import in_second_tier
 
 from drakegrasp.dataset.reader import GraspDataset
@@ -27,70 +28,15 @@ from drakegrasp.objects.sources import find_meshes
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-#: Lines of plain blocks that are not run as they stand, by how they begin, and why.
-NOT_RUN = {
-    "make ": "`make` runs this test",
-    "pip install ": "installing",
-    "python3 -m venv ": "installing",
-    "env/bin/": "installing",
-    "ssh ": "another machine",
-    "dask ": "a cluster; tests/cluster starts one",
-    "drakegrasp submit ": "a cluster; tests/cluster/test_submit.py",
-    "python pipelines/make_certificates.py ": "a cluster; tests/cluster/test_submit.py",
-    "tls=": "options of the lines below it",
-    "python pipelines/baseline/": "trains with torch; tests/test_baseline.py",
-    "drakegrasp reach OUT --arm panda": "wants the extra arms; tests/reach/test_rows.py",
-    "drakegrasp reach OUT --arm panda --base -0.5,0,0,0 --map": "tests/reach/test_rows.py",
-    "drakegrasp assemble OUT --set filters.reachable": "wants the same; tests/reach/test_rows.py",
-    "drakegrasp predict cloud.npy --out grasps.h5 --arm": "the same; tests/reach/test_verdicts.py",
-    "drakegrasp scenes ": "renders for minutes; tests/generation/test_make_scenes.py",
-    "drakegrasp scenes demo/dataset": "wants the demo; tests/generation/test_make_scenes.py",
-    "drakegrasp scenes TRIED": "wants a dataset; tests/generation/test_make_scenes.py",
-    "python docs/examples/": "tests/test_examples.py runs it",
-    "python pipelines/measurements/": "measures for minutes to hours",
-    "drakegrasp build ": "simulates for minutes to hours; tests/generation; a dry run is run",
-    "drakegrasp objects export ": "makes hundreds of meshes; tests/shapes/test_shape_catalog.py",
-    "drakegrasp inspect ": "serves until Ctrl-C; tests/page/test_serve.py",
-    "drakegrasp merge ": "wants two datasets; tests/generation/test_merge.py",
-    "drakegrasp predict ": "wants a network's input; tests/cli/test_predict.py",
-    "drakegrasp score ": "tries hundreds of grasps; tests/cli/test_score_command.py",
-    "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
-    "drakegrasp hand new ": "a model that may not be shipped; tests/hand/test_new_hand.py",
-    "drakegrasp hand check ": "tests/hand/test_check_hand.py runs it",
-    "drakegrasp export OUT POSES ": "wants the package of the page; tests/test_plugin.py",
-    "drakegrasp verify FILE ": "wants a file of postures; tests/cli/test_verify_request.py",
-    "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols",
-}
+#: Lines of plain blocks that are not run as they stand, by how they begin; blocks that are no code,
+#: by their first lines; and blocks marked `py`, Python that is not run, by a part of it. And why.
+NOT_RUN, NO_CODE, PY_NOT_RUN = (
+    table("doc_blocks")[kind] for kind in ("not run", "no code", "py not run")
+)
 #: Pages whose commands measure for minutes to hours; test_docs.py knows their options.
 MEASURED = "docs/results/"
 #: A page whose Python blocks are the scripts beside it; test_examples.py runs them.
 GALLERY = "docs/examples/index.md"
-#: Blocks that are no code, by their first lines, and what they are.
-NO_CODE = {
-    "demo/meshes/ ": "files of the demo",
-    "OUT/": "files of a dataset",
-    "OUT/manifest.json ": "files of a dataset",
-    "The grasp of 15_candlestick_short": "what `explain` says",
-    "ok    files ": "what `hand check` prints",
-    "api/building.py  ": "the calls of a build",
-    "f = S / (2 tan": "a formula",
-    "minimise ": "a formula",
-    "Σ_i ": "a formula",
-}
-#: Blocks marked `py`: Python that is not run as it stands, by a part of it, and why.
-PY_NOT_RUN = {
-    "dg.fit_table(": "wants a depth image; tests/vision/test_depth_image.py",
-    "simulate=5, view=view": "wants a depth image; tests/scoring/test_predicting.py",
-    "dg.build_dataset(": "simulates for hours; tests/test_api.py",
-    'dg.load_arm("ur5"': "wants the extra arms; tests/reach/test_rows.py",
-    'dg.load_arm("panda"': "wants the extra arms; tests/reach/test_verdicts.py",
-    "read_closed_grasps(out)": "an exporter of the reader; tests/test_plugin.py",
-    "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
-    "dg.predict_scenes(": "wants scenes and a cluster; tests/cli/test_predict_scenes.py",
-    "dg.SceneDataset(": "wants scenes and torch; tests/dataset/test_scene_reader.py",
-    'dg.verify_grasp(grasp, "mug.obj"': "tests/test_api.py",
-    'dg.place_object("mug.obj"': "tests/verification/test_verify.py",
-}
 #: Commands that simulate, which want a dataset that was simulated.
 SIMULATED = ("replay", "verify")
 

@@ -17,6 +17,7 @@ from helpers.golden import Golden, points, short
 from helpers.hands import PAGE as PATH
 from helpers.hands import copy_model, write_tongs
 from helpers.machine import needs_egl
+from helpers.tables import table
 from helpers.tiers import in_second_tier
 from helpers.vendors import box, fixed, link
 
@@ -48,99 +49,18 @@ def change(path: Path, suffix: str, old: str, new: str) -> None:
     file.write_text(text.replace(old, new, 1))
 
 
-RATIO = "ratio: 0.333333333333"
-REGION = "pad_region: [[1, 0, 0, 0.018], [0.085, 1, 0, 0.00153]]"
-POINT = "pad_point: [0.052, 0.0063, 0.0]"
-PALM_SHAPE = (
-    '    <collision><origin xyz="0 0 -0.015"/><geometry><box size="0.06 0.14 0.03"/></geometry>'
-    "</collision>\n"
+FAULTS = table("spoilt_hands")
+PALM_SHAPE, SPREAD_AXIS = (
+    FAULTS[case]["old"]
+    for case in (
+        "palm without a shape",
+        "spread joints that the model turns against each other",
+    )
 )
-SPREAD_LIMIT = "<xyz>0 0 -1</xyz>\n        <limit><lower>0</lower>"
-SPREAD_AXIS = "<child>finger2_spread</child>\n      <axis>\n        <xyz>0 0 1</xyz>"
 MIMIC = "<mimic joint='{}'><multiplier>{}</multiplier></mimic>"
 POST = (
     link("post", 0.1, box("0.02 0.02 {0}", "0.1 0 {1}")) + fixed("f", "palm", "post") + "</robot>"
 )
-INERTIA = '<inertia ixx="1.86e-3" iyy="3.0e-4" izz="1.74e-3" ixy="0" ixz="0" iyz="-2e-5"/>'
-# fmt: off
-#: The hand, its file, what is replaced by what, the check that fails, and what it says.
-FAULTS = {
-    "missing fingertip": (
-        "barrett", ".yaml", "fingertip: finger1_distal", "fingertip: finger1_nail", "files",
-        r"fingers\.0\.fingertip: must be a link of the model .* got 'finger1_nail'"),
-    "palm axis into the hand": (
-        "barrett", ".yaml", "rpy_deg: [0.0, 0.0, 0.0]", "rpy_deg: [180.0, 0.0, 0.0]", "palm",
-        r"the palm ray along \+Gz must be free, got link 'base' .* check palm\.p_BG and "
-        r"palm\.rpy_deg; \+Gz must point to where the fingertips close"),
-    "palm buried": (
-        "barrett", ".yaml", "p_BG: [0.0, 0.0, 0.07795]", "p_BG: [0.0, 0.0, 0.05]", "palm",
-        r"the palm ray along \+Gz must be free, got link 'base' up to 29 mm"),
-    "joint without limit": (
-        "barrett", ".sdf", "<lower>0</lower><upper>2.443460953</upper>", "", "limits",
-        r"joint 'finger1_proximal_joint' must have limits, got -inf\.\.inf"),
-    "spread half a degree before its joints": (
-        "barrett", ".sdf", SPREAD_LIMIT, SPREAD_LIMIT.replace(">0<", ">0.0087266463<"), "limits",
-        r"spreads_deg must be 0\.5\.\.180, got 0$"),
-    "zero mass": (
-        "barrett", ".sdf", "<mass>0.04166</mass>", "<mass>0</mass>", "masses",
-        r"link 'finger1_distal' must have a mass above 0 kg, got 0"),
-    "missing mesh": (
-        "barrett", ".sdf", "barrett_distal.obj", "gone.obj", "files", r"model: .*gone\.obj"),
-    "wrong sign of a ratio that limits catch": (
-        "barrett", ".yaml", RATIO, RATIO.replace("0.3", "-0.3"), "limits",
-        r"finger 'F1' must be open at 0 and able to close, but limits of its coupled joints "
-        r"\(finger1_distal_joint by -0\.333333 and 0\) leave .*: check signs of ratios"),
-    "offset that opens too far": (
-        "barrett", ".yaml", RATIO, f"{RATIO}, offset: -0.2", "limits",
-        r"finger 'F1' must be open at 0 and able to close, but limits of its coupled joints "
-        r"\(finger1_distal_joint by 0\.333333 and -0\.2\) leave 0\.6\.\."),
-    "wrong sign of a ratio that limits allow": (
-        "allegro", ".yaml", "index_pip_joint, ratio: 1.0", "index_pip_joint, ratio: -1.0",
-        "fingertips", r"got that of index \d+ mm short; check the signs of the ratios"),
-    "pad region off the surface": (
-        "barrett", ".yaml", f"{REGION}\n    {POINT}",
-        "pad_region: [[1, 0, 0, 0.07]]\n    pad_point: [0.09, 0.0063, 0.0]", "files",
-        r"fingers\.0\.pad_region: must hold a part of the surface of link 'finger1_distal'"),
-    "pad point off the surface": (
-        "barrett", ".yaml", POINT, POINT.replace("0.0063", "0.02"), "pads",
-        r"fingers\.0\.pad_point must lie on the surface of link 'finger1_distal', got one 11"),
-    "pad on the back": (
-        "barrett", ".yaml", f"{REGION}\n    {POINT}",
-        "pad_region: [[0, -1, 0, 0]]\n    pad_point: [0.03, -0.0065, 0.0]", "pads",
-        r"the pad of finger 'F1' must face where the finger closes"),
-    "too slow for its motor": (
-        "barrett", ".yaml", "closing_speed_deg: 60.0", "closing_speed_deg: 10.0", "efforts",
-        r"finger 'F3' must close fast enough for its motor: .* 3\.49 of 4 N m; .* close\.max_time"),
-    "payload beyond its strength": (
-        "barrett", ".yaml", "payload: 2.5", "payload: 4.99", "efforts",
-        r"payload must be at most 4\.987 kg, which friction carries, got 4\.99 kg"),
-    "palm without a shape": (
-        "tongs", ".urdf", PALM_SHAPE, "", "palm",
-        r"link 'palm', or one that is fixed to it, must have a collision shape, got none"),
-    "post that the palm cannot bring to a table": (
-        "tongs", ".urdf", "</robot>", POST.format(0.3, 0.15), "palm",
-        "the palm must be able to face a table, but the hand reaches 2"),
-    "spread joints that the model turns against each other": (
-        "barrett", ".sdf", SPREAD_AXIS, SPREAD_AXIS + MIMIC.format("finger1_spread_joint", -1.0),
-        "couplings",
-        r"joint 'finger2_spread_joint' must be coupled to 'finger1_spread_joint' by -1 and 0, as"),
-    "finger that opens": (
-        "franka", ".urdf", '<axis xyz="0 1 0"/>', '<axis xyz="0 -1 0"/>', "pads",
-        r"the pad of finger 'right' must face where the finger closes, got its back: check"),
-    "another coupling in the model": (
-        "allegro", ".sdf", "<xyz>0 1 0</xyz>\n        <limit><lower>-0.174",
-        '<xyz>0 1 0</xyz><mimic joint="index_mcp_joint"><multiplier>-1</multiplier>'
-        "<offset>0.1</offset><reference>0.1</reference></mimic>\n        <limit><lower>-0.174",
-        "couplings",
-        r"joint 'index_pip_joint' must be coupled to 'index_mcp_joint' by -1 and 0\.2, as in"),
-    "inertia of a body that is too long": (
-        "franka", ".urdf", INERTIA, INERTIA.replace("1.86e-3", "1e-1"), "masses",
-        r"link 'hand' must have an inertia that a body can have, got principal moments .*, 0\.1"),
-    "inertia of nothing": (
-        "franka", ".urdf", INERTIA, '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>',
-        "masses", "link 'hand' must have an inertia that a body can have, got 0"),
-}
-# fmt: on
 
 
 @pytest.fixture(autouse=True)
@@ -164,10 +84,10 @@ def test_a_spoilt_hand_fails_with_a_message_that_names_the_fault(
     tmp_path: Path, fault: str
 ) -> None:
     """No other check fails, and none of these needs a simulation to be seen."""
-    name, suffix, old, new, *found = FAULTS[fault]
-    path = copied(tmp_path, name)
-    change(path, suffix, old, new)
-    refuse(path, *found)
+    case = FAULTS[fault]
+    path = copied(tmp_path, case["hand"])
+    change(path, case["file"], case["old"], case["new"])
+    refuse(path, case["check"], case["said"])
 
 
 def test_a_mirrored_order_of_fingers_is_refused(tmp_path: Path) -> None:

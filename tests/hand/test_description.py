@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from helpers.hands import (
     write_slider,
     write_tongs,
 )
+from helpers.tables import table
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.config import CarriedHand
@@ -155,97 +157,25 @@ def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:
         load_hand("shadow")
 
 
-LEFT = PINCER["fingers"][0]
-SLIDING = {
-    **{key: value for key, value in LEFT.items() if key != "torque_limit"},
-    "force_limit": 5.0,
-}
-# fmt: off
-#: Changes of the gripper's hand file, and what is said of them.
-REFUSALS = {
-    "unknown key": ({"colour": "red"}, r"colour: must be a key of a hand file"),
-    "missing key": ({"palm": {"link": "palm"}}, r"palm\.p_BG: must be given"),
-    "bad type": ({"fingers": changed_finger(torque_limit="strong")},
-                 r"fingers\.0\.torque_limit: must be a valid number.*got 'strong'"),
-    "not positive": ({"closing_speed_deg": 0}, r"closing_speed_deg: must be greater than 0, got 0"),
-    "another version": ({"version": 2}, r"version: must be 1, .* got 2"),
-    "no fingers": ({"fingers": []}, r"fingers: must be a list of at least 1, got \[\]"),
-    "two fingers of one name": ({"fingers": changed_finger(name="right")},
-                                r"fingers must have a name each, got right, right"),
-    "zero ratio": ({"fingers": changed_finger(coupled=[{"joint": "right_hinge", "ratio": 0}])},
-                   r"fingers\.0\.coupled\.0: ratio must not be zero"),
-    "flat region": ({"fingers": changed_finger(pad_region=[[0, 1, 0, 0], [0, 0, 0, 1]])},
-                    r"fingers\.0: pad_region\.1 must have a normal that is not zero"),
-    "pad point outside": ({"fingers": changed_finger(pad_region=[[0, 0, 2, 0.19]])},
-                          r"fingers\.0: pad_point must lie in the pad_region, got \[0\.0, 0\.01, "),
-    "empty pad": (
-        {"fingers": changed_finger(pad_region=[[0, 0, 1, 0.12]], pad_point=[0.0, 0.01, 0.13])},
-        r"fingers\.0\.pad_region: must hold a part of the surface of link 'left', got none"),
-    "worm of unknown strength": (
-        {"drive": "worm"}, r"fingers\.0\.holding_torque must be given where drive is worm"),
-    "worm weaker than its motor": (
-        {"drive": "worm", "fingers": changed_finger(holding_torque=0.5)},
-        r"fingers\.0: holding_torque must be at least the torque_limit of 1 N m, got 0\.5"),
-    "no effort": ({"fingers": [{k: v for k, v in LEFT.items() if k != "torque_limit"}]},
-                  r"fingers\.0: torque_limit must be given .* else force_limit, got none$"),
-    "two efforts": ({"fingers": changed_finger(force_limit=1.0)},
-                    r"fingers\.0: torque_limit must be .* got both"),
-    "holding force of a turning joint": (
-        {"fingers": changed_finger(holding_force=9.0)},
-        r"fingers\.0: holding_force must be holding_torque together with torque_limit"),
-    "force of a turning joint": (
-        {"fingers": [SLIDING, PINCER["fingers"][1]], "closing_speed": 0.1},
-        r"fingers\.0\.torque_limit: must be given, as joint 'left_hinge' turns"),
-    "speed of no joint": ({"closing_speed": 0.1},
-                          r"closing_speed must be left out: no closing joint slides"),
-    "stand-offs in millimetres": ({"standoffs": [0.03, 44]},
-                                  r"hand\.yaml: standoffs\.1: must be at most 1 m, got 44 m$"),
-    "spreads without a spread": (
-        {"spreads_deg": [0, 10]},
-        r"spreads_deg must be \[0\] without spread\.joints, got \[0\.0, 10\.0\]"),
-    "missing file": ({"model": "gone.sdf"},
-                     r"model: must be an SDFormat or URDF file, got '.*gone\.sdf'"),
-    "not a model": ({"model": "pincer_hand.yaml"}, r"model: must be a file of one model"),
-    "missing palm": ({"palm": {"link": "wrist", "p_BG": [0, 0, 0]}},
-                     r"palm\.link: must be a link of the model \(palm, .*right\), got 'wrist'"),
-    "missing link": ({"fingers": changed_finger(fingertip="thumb")},
-                     r"fingers\.0\.fingertip: must be a link of the model .*right\), got 'thumb'"),
-    "missing joint": ({"fingers": changed_finger(closing_joint="knee")},
-                      r"fingers\.0\.closing_joint: .* \(left_hinge, right_hinge\), got 'knee'"),
-    "joint driven twice": ({"spread": {"joints": ["left_hinge"]}},
-                           r"fingers\.0\.closing_joint: must be a joint that nothing else drives"),
-    "joint driven by nothing": ({"fingers": changed_finger()[:1]},
-                                r"every joint must be driven .* got right_hinge driven by nothing"),
-    "closing joint elsewhere": (
-        {"fingers": [{**LEFT, "fingertip": "right"}, PINCER["fingers"][1]]},
-        r"fingers\.0\.closing_joint: must lie between the palm link and the fingertip"),
-    "palm not inward": (
-        {"palm": {"link": "right", "p_BG": [0, 0, 0]}},
-        r"link 'left' must be joined to the palm link 'right', got a chain that ends at 'palm'"),
-    "preshape of no joint": ({"preshape": {"knee": 0.0}},
-                             r"preshape\.knee: must be a revolute or prismatic joint of the model"),
-    "preshape of a closing joint": (
-        {"preshape": {"left_hinge": 0.0}},
-        r"fingers\.0\.closing_joint: must be a joint that nothing else drives"),
-    "preshape beyond the limits": (
-        {"preshape": {"right_hinge": 2.0}, "fingers": changed_finger()[:1]},
-        r"preshape\.right_hinge: must be 0\.\.1, the joint's limits, got 2"),
-    "a joint that is neither of both kinds": (
-        {"sdf": PINCER_SDF.replace("revolute", "ball")},
-        r"'left_hinge' must be revolute, prismatic or fixed, got"),
-    "the world's joint": (
-        {"sdf": PINCER_SDF.replace("<parent>palm</parent><child>mount",
-                                   "<parent>world</parent><child>mount")},
-        r"joint 'fixed' must join two links of the hand"),
-}
-# fmt: on
+REFUSALS = table("hand_file")
+
+
+def spoilt(
+    left: dict[str, Any] | None = None, replace: tuple[str, str] = ("", ""), **changes: Any
+) -> dict[str, Any]:
+    """Return what `write_pincer` writes for a case of the table."""
+    first, second = PINCER["fingers"]
+    first = {k: v for k, v in {**first, **(left or {})}.items() if v is not None}
+    fingers = [first, changes.pop("right", second)]
+    given = {"fingers": [each for each in fingers if each], "sdf": PINCER_SDF.replace(*replace)}
+    return given | changes
 
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_a_bad_description_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
-    changes, message = REFUSALS[case]
-    with pytest.raises(HandError, match=message) as info:
-        load_hand(write_pincer(tmp_path, **changes))
+    path = write_pincer(tmp_path, **spoilt(**REFUSALS[case]["given"]))
+    with pytest.raises(HandError, match=REFUSALS[case]["said"]) as info:
+        load_hand(path)
     assert "\n" not in str(info.value)
     assert str(tmp_path / "pincer_hand.yaml") in str(info.value)
 

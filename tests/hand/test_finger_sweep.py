@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from helpers.hands import PINCER_SDF, write_pincer, write_slider
+from helpers.hands import PINCER_SDF, SLIDER, write_pincer, write_slider
 
 from drakegrasp.frames import invert_pose, transform_points
 from drakegrasp.hand.description import load_hand
@@ -141,3 +141,29 @@ def test_a_pinch_is_where_the_pads_leave_its_width(tmp_path) -> None:
     assert pinch.p_GM[1] == pytest.approx(0.0, abs=1e-3)
     assert find_pinch(hand, 0.1) is None
     assert reach(hand, np.array([0.0, 0.0, 1.0])) == pytest.approx(0.1, abs=1e-9)
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.02, -0.02])
+def test_fingers_around_a_centre_close_against_the_last_one(tmp_path, turned: float) -> None:
+    """Three sliding fingers at 120 degrees, two of them mounted a little beside [rad]."""
+    palm, _, left = SLIDER.partition('<link name="left">')
+    link = left.partition("</link>")[0]
+    parts, fingers = [palm], []
+    for name, yaw in (
+        ("a", turned - np.pi / 6.0),
+        ("b", turned + 7.0 * np.pi / 6.0),
+        ("c", np.pi / 2.0),
+    ):
+        x, y = 0.04 * np.cos(yaw), 0.04 * np.sin(yaw)
+        parts.append(
+            f'<link name="{name}">{link}</link>'
+            f'<joint name="{name}_slide" type="prismatic"><parent link="palm"/>'
+            f'<child link="{name}"/><origin xyz="{x} {y} 0.01" rpy="0 0 {yaw + np.pi / 2.0}"/>'
+            '<axis xyz="0 1 0"/><limit lower="0" upper="0.04" effort="20" velocity="1"/></joint>'
+        )
+        finger = {"name": name, "fingertip": name, "closing_joint": f"{name}_slide"}
+        fingers.append({**finger, "force_limit": 20.0, "pad_point": [0.0, 0.0, 0.09]})
+    hand = load_hand(write_slider(tmp_path, "".join([*parts, "</robot>"]), fingers=fingers))
+    axis, group = find_opposition(hand)
+    np.testing.assert_allclose(axis, [0.0, 1.0, 0.0], atol=1e-9)
+    assert group.tolist() == [True, True, False]

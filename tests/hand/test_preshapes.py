@@ -19,6 +19,7 @@ from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import TrialSetup, trial_rows
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
@@ -180,3 +181,10 @@ def test_exports_leave_the_fingers_that_a_grasp_does_not_use_where_they_are(
     for stage in ("pregrasp_qpos", "squeeze_qpos"):
         differs = stages[stage][7:] != stages["grasp_qpos"][7:]
         assert {n for n, d in zip(posed.joints, differs, strict=True) if d} == moving
+
+
+def test_bits_say_which_fingers_are_left_out() -> None:
+    np.testing.assert_array_equal(
+        unused_fingers([0, 1, 6], 3),
+        [[False, False, False], [True, False, False], [False, True, True]],
+    )

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 import drakegrasp.mesh.components
 import drakegrasp.mesh.repair
 from drakegrasp.errors import MeshError
+from drakegrasp.mesh.components import part_touching_edges
+from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     is_solid_surface,
     signed_volume,
@@ -204,3 +206,23 @@ def test_what_passes_through_itself_is_kept_noted_or_refused(share, said, monkey
         return
     drakegrasp.mesh.components.check_self_intersection(*surface, notes)
     assert any("passes through" in note for note in notes) is (said == "noted")
+
+
+def test_touching_edge_gets_a_vertex_for_each_side():
+    """Two bricks share an edge; each keeps its own two faces at both halves of it."""
+    corner, other = box((0.02,) * 3), box((0.02,) * 3, (0.02, 0.02, 0.0))
+    vertices, faces = weld(
+        np.vstack((corner.vertices, other.vertices)), np.vstack((corner.faces, other.faces + 8))
+    )
+    assert not is_solid_surface(faces)
+    parted, new_faces = part_touching_edges(vertices, faces)
+    assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
+    np.testing.assert_allclose(parted[-2:], [[0.01, 0.01, 0.0]] * 2, atol=1e-12)
+    assert is_solid_surface(new_faces)
+    assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
+
+
+def test_signed_volume_does_not_depend_on_the_place():
+    cube = box(at=(100.0, -50.0, 7.0))
+    volume = signed_volume(np.array(cube.vertices), np.array(cube.faces))
+    assert volume == pytest.approx(np.prod(BOX), rel=1e-9)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from helpers.meshes import G3DB, assert_sound, box, needs_g3db, write
+from helpers.tables import table
 
 from drakegrasp.errors import MeshError
 from drakegrasp.objects.model import prepare_object
@@ -88,33 +89,7 @@ def test_what_triangles_do_not_say_is_in_the_manifest_and_in_the_digest(tmp_path
     assert (source.mass, source.density, source.friction) == (None, 700.0, 0.4)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("objects: {a: {mass: 0}}", r"objects\.a\.mass: .*greater than 0.*got 0"),
-        ("objects: {a: {mass: heavy}}", r"objects\.a\.mass: .*number.*got 'heavy'"),
-        ("objects: {a: {friction: yes}}", r"objects\.a\.friction: .*number"),
-        ("objects: {a: {scale: .inf}}", r"objects\.a\.scale: .*finite"),
-        ("objects: {a: {up: y}}", r"objects\.a\.up: must be .* or '-z', got 'y'"),
-        ("objects: {a: {mass: 1, density: 2}}", "mass must not be given with density, got 1 kg"),
-        ("units: inch", r"units: .*'m', 'cm' or 'mm'.*got 'inch'"),
-        ("unit: cm", r"unit: must be a known key \(units, licence, objects\), got an unknown one"),
-        (
-            "objects: {a: {unit: cm}}",
-            r"objects\.a\.unit: must be a known key \(units, scale, up, class, name, mass, ",
-        ),
-        ("objects: {b: {units: cm}}", r"must be names of meshes in .*: a; got b"),
-        ("objects: {a: {name: ''}}", "name must be printable"),
-        ("objects: {a: {name: x/y}}", "without slashes"),
-        ("objects: {a: {group: ../b}}", r"a\.obj: the group must be .*, got '\.\./b'"),
-        ("licence: ''", "licence: "),
-        ("licence: [MIT]", "licence: "),
-        ('licence: "a\\nb"', "licence: "),
-        ("- a", "the file: must be a mapping of keys to values, got "),
-        ("objects: {a: 3}", r"objects\.a: must be a mapping of keys to values, got 3"),
-        ("units: [", "readable YAML"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), table("objects"))
 def test_wrong_manifest_is_refused(tmp_path, text, message):
     write(tmp_path / "a.obj", box())
     (tmp_path / "objects.yaml").write_text(text)

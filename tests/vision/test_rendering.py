@@ -42,6 +42,8 @@ K = intrinsics(CONFIG)
 EXTENTS = np.array([0.06, 0.08, 0.10])
 HALF = EXTENTS / 2.0
 X_TO = make_pose(np.eye(3), [0.0, 0.0, HALF[2]])
+#: On the side towards +Oy.
+LYING = make_pose([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [0.0, 0.0, HALF[1]])
 #: Columns are the camera's axes in {T}: looking along -x, from +x, world up on top.
 R_FROM_X = np.column_stack([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 #: Looking along -y, from +y, world up on top.
@@ -82,7 +84,7 @@ def oblique() -> Array:
     return make_pose(np.column_stack([x, np.cross(z, x), z]), p_TC)
 
 
-def object_points(seen: RenderedView, X_TC: Array) -> Array:
+def object_points(seen: RenderedView, X_TC: Array, X_TO: Array) -> Array:
     """Return p_OQ (n, 3) of the mask's pixels, unprojected with their depth."""
     rows, columns = np.nonzero(seen.mask)
     p_CQ = unproject(K, np.column_stack([columns, rows]), seen.image[3][rows, columns])
@@ -136,16 +138,17 @@ def test_pixels_beyond_the_table_hold_far(renderer: Renderer) -> None:
     np.testing.assert_array_equal(seen.image[3, 63:65, 63:65], np.float32(CONFIG.far))
 
 
-def test_mask_and_depth_agree(renderer: Renderer) -> None:
+@pytest.mark.parametrize("X_TO", [X_TO, LYING], ids=["standing", "lying"])
+def test_mask_and_depth_agree(renderer: Renderer, X_TO: Array) -> None:
     """Pixels of the mask, unprojected, lie on the box; all others lie off it."""
     X_TC = oblique()
     seen = render(renderer, X_TO, X_TC)
     assert 500 < seen.mask.sum() < 128 * 128 / 2
-    assert np.abs(box_distance(object_points(seen, X_TC), HALF)).max() < 1e-6
-    inverted = replace(seen, mask=1 - seen.mask)
+    assert np.abs(box_distance(object_points(seen, X_TC, X_TO), HALF)).max() < 1e-6
+    inverted = object_points(replace(seen, mask=1 - seen.mask), X_TC, X_TO)
     # The table's pixels at the foot of the box come near to it.
-    assert np.median(box_distance(object_points(inverted, X_TC), HALF)) > 0.02
-    assert box_distance(object_points(inverted, X_TC), HALF).min() > -1e-6
+    assert np.median(box_distance(inverted, HALF)) > 0.02
+    assert box_distance(inverted, HALF).min() > -1e-6
 
 
 def test_depth_beyond_the_box_moves_along_its_ray() -> None:

@@ -18,7 +18,13 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.verification.wrist_problem import hand_constants, nearest_on_pads, signed_distance
-from drakegrasp.verification.wrist_solver import LEVER, find_starts, fit_wrist, make_postures
+from drakegrasp.verification.wrist_solver import (
+    DIFFERENT,
+    LEVER,
+    find_starts,
+    fit_wrist,
+    make_postures,
+)
 
 SEEDS = range(25)
 #: Of the table's normal; above the table by so much that it never matters [m].
@@ -266,3 +272,16 @@ def test_two_contacts_are_reached_from_all_around_their_line():
     angles = np.sort(np.arctan2(directions[:, 2], directions[:, 0]))
     gaps = np.diff(np.r_[angles, angles[0] + 2.0 * np.pi])
     assert np.rad2deg(gaps.max()) < 15.0
+
+
+def test_starts_tell_left_from_right(monkeypatch):
+    """Mirrored contacts have the same lengths and angles; their posture must be another."""
+    monkeypatch.setattr(drakegrasp.verification.wrist_solver, "NEAREST", 1)
+    postures, mirror = make_postures(hand_of("barrett")), np.diag([-1.0, 1.0, 1.0])
+    wanted = np.deg2rad([33.75, 32.0, 88.0, 56.0])
+    row = int(np.abs(postures.coordinates - wanted).max(axis=1).argmin())
+    p, n = postures.p_GP[row], postures.n_G[row]
+    ((_, own),) = find_starts(postures, p, -n, 1)
+    ((_, image),) = find_starts(postures, p @ mirror, -n @ mirror, 1)
+    np.testing.assert_allclose(own, wanted, atol=1e-9)
+    assert np.abs(image - wanted).max() > DIFFERENT
