@@ -213,10 +213,7 @@ def test_contacts_in_the_frame_of_the_mesh_file_are_told_and_read_on_a_sample(
         ({"units": "cm"}, "units must be None on a GraspDataset, which defines it, got a value"),
         ({"X_TC": np.eye(4)}, "X_TC must be None on a GraspDataset"),
         ({"X_TO": np.eye(4)}, "X_TO must be None on a GraspDataset"),
-        (
-            {"on": "OUT/data.hdf5"},
-            r"on must be GraspDataset\('OUT/data.hdf5', split=...\) for a data",
-        ),
+        ({"on": "OUT/data.hdf5"}, r"on must be GraspDataset\('OUT/data.hdf5', split=...\) for"),
         ({"on": None}, "on must be the path of a mesh, .* or a GraspDataset, got a NoneType"),
         ({"on": "cup.obj"}, r"rows must be given with a GraspDataset only, got \[0\]"),
         ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
@@ -229,10 +226,7 @@ def test_contacts_in_the_frame_of_the_mesh_file_are_told_and_read_on_a_sample(
         ({"rows": []}, r"rows must be one per grasp \(1\), got 0"),
         ({"rows": None}, "without rows there must be a grasp for each of the"),
         # Its objects are prepared: what the configuration says of them could not be kept.
-        (
-            {"config": load_config(overrides=["objects.mass=2"])},
-            "objects must be as in the dataset",
-        ),
+        ({"config": load_config(overrides=["objects.mass=2"])}, "objects must be as in the data"),
     ],
 )
 def test_what_does_not_go_together_is_refused(
@@ -288,14 +282,8 @@ def test_everything_that_a_grasp_can_be_on(test_split: GraspDataset, tmp_path: P
     sample = test_split[row]
     by_row = verify_grasp(sample.grasp, test_split, row=row)
     assert by_row.config.hand == "barrett" and by_row.surface_distance.max() < 0.005
-    copies = [
-        sample,
-        test_split[row:][0],
-        copy.deepcopy(sample),
-        pickle.loads(pickle.dumps(sample)),
-    ]
-    copies.append(replace(sample, trial_id=0))
-    for each in copies:
+    copies = [copy.deepcopy(sample), pickle.loads(pickle.dumps(sample))]
+    for each in (sample, test_split[row:][0], *copies, replace(sample, trial_id=0)):
         assert same(by_row, verify_grasp(sample.grasp, each))
     pair = verify_grasps([sample.grasp, sample.grasp], sample)
     assert [same(by_row, each) for each in pair] == [True, True]

@@ -46,8 +46,6 @@ ORDER = (
 )
 #: Folders of data, without code.
 DATA = {"models", "presets"}
-#: A body of so many lines has paragraphs.
-LONG_BODY = 20
 #: What only some places may import, at any depth of their code.
 WALLS = {
     "dask": ("cluster",),
@@ -247,27 +245,3 @@ def test_code_names_a_hand_only_as_a_default() -> None:
         ("config", "barrett"),
         ("hand.description", "barrett"),
     ]
-
-
-def statements_of(function: ast.FunctionDef) -> list[ast.stmt]:
-    """Return the body of a function without its docstring."""
-    return function.body[1:] if ast.get_docstring(function) is not None else function.body
-
-
-def has_paragraphs(function: ast.FunctionDef, lines: list[str]) -> bool:
-    """Return whether a body is short, or has a blank line or a line of comment."""
-    body = statements_of(function)
-    if not body:
-        return True
-    text = [line.strip() for line in lines[body[0].lineno - 1 : body[-1].end_lineno]]
-    return len(text) < LONG_BODY or any(not line or line.startswith("#") for line in text)
-
-
-def test_long_bodies_have_paragraphs() -> None:
-    """A reader sees the steps: a line of intent, or at least a blank line, between them."""
-    bare = []
-    for module, path in MODULE_NAMES.items():
-        lines = path.read_text(encoding="utf-8").splitlines()
-        functions = [n for n in ast.walk(tree_of(module)) if isinstance(n, ast.FunctionDef)]
-        bare += [f"{module}.{f.name}" for f in functions if not has_paragraphs(f, lines)]
-    assert not bare

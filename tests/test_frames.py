@@ -142,10 +142,7 @@ BAD_POSES: dict[str, tuple[Any, str]] = {
     "ragged": ([[1, 2], [3]], "X_TC must be a pose, 4 x 4 numbers, got a list that cannot be read"),
     "rotation": (np.eye(3), "X_TC must be a pose, 4 x 4 numbers, got an array of shape (3, 3)"),
     "vector": (np.zeros(16), "X_TC must be a pose, 4 x 4 numbers, got an array of shape (16,)"),
-    "too deep": (
-        np.zeros((2, 2, 4, 4)),
-        "X_TC must be a pose, 4 x 4 numbers, got an array of shape (2, 2, 4, 4)",
-    ),
+    "too deep": (np.zeros((2, 2, 4, 4)), "4 x 4 numbers, got an array of shape (2, 2, 4, 4)"),
     "nan": (changed(np.eye(4), (0, 3), np.nan), "X_TC must be finite, got numbers that are not"),
     "mirror": (np.diag([1.0, 1.0, -1.0, 1.0]), "with determinant -1"),
     "scaled": (np.diag([1.001, 1.001, 1.001, 1.0]), "that is off by 0.002"),

@@ -79,18 +79,9 @@ def test_names_of_others_follow_and_take_none_of_ours() -> None:
     [
         ("fbx", "exporters must be one of hf, original, .*, got 'fbx'", ConfigError),
         ("old", "exporters: old must be loaded from json:no_such", ConfigError),
-        (
-            "gone",
-            r"no_such_library must be .*: pip install 'drakegrasp\[hub\]'",
-            MachineError,
-        ),
+        ("gone", r"no_such_library must be .*: pip install 'drakegrasp\[hub\]'", MachineError),
         ("sad", "exporters: sad of the package their-package must be loaded from", ConfigError),
-        (
-            "bad",
-            r"no_such_library must be installed for bad of the package their-package: pip install "
-            r"'their-package\[fast\]'",
-            MachineError,
-        ),
+        ("bad", r"no_such_library .* package their-package: .*their-package\[fast\]", MachineError),
     ],
 )
 def test_what_cannot_be_used_is_one_line(name: str, words: str, kind: type[Exception]) -> None:

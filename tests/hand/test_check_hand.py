@@ -63,13 +63,6 @@ POST = (
 )
 
 
-@pytest.fixture(autouse=True)
-def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Files and geometry decide, but in tests that are marked."""
-    if "sim" not in request.keywords:
-        monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
-
-
 def refuse(path: Path, check: str, message: str) -> None:
     """Check that one check of a hand fails, with a message of a line."""
     findings = check_hand(path)

@@ -24,13 +24,6 @@ from drakegrasp.hand.kinematics import closed_positions
 from drakegrasp.hand_setup import NewHand, draft_hand
 
 
-@pytest.fixture(autouse=True)
-def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Geometry decides, but in tests that are marked."""
-    if "sim" not in request.keywords:
-        monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
-
-
 def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -> NewHand:
     path = write_model(folder / "vendor", text, name)
     return draft_hand(path, folder / "out", answers=Answers(**answers))  # type: ignore[arg-type]
@@ -193,16 +186,8 @@ def test_a_drafted_gripper_passes_every_check(tmp_path: Path) -> None:
     ("name", "text", "suffix"),
     [("jaws", JAWS, "urdf"), ("jaws_mjcf", JAWS_MJCF, "xml"), ("mitten", MITTEN, "urdf")],
 )
-def test_draft(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    golden: Golden,
-    name: str,
-    text: str,
-    suffix: str,
-) -> None:
+def test_draft(tmp_path: Path, golden: Golden, name: str, text: str, suffix: str) -> None:
     """The hand file with its comments, the model, the meshes, notes and findings."""
-    monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
     model = write_model(tmp_path / "vendor", text, f"{name}.{suffix}")
     drafted = draft_hand(model, tmp_path / "out")
     lines = [*drafted.notes, *(f"{f.ok} {f.name}: {f.text}" for f in drafted.findings)]

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 from helpers.commands import run
-from helpers.vendors import JAWS, JAWS_MJCF, fixed, link, write_model
+from helpers.tables import table
+from helpers.vendors import JAWS, JAWS_MJCF, link, write_model
 
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
@@ -19,11 +20,8 @@ from drakegrasp.hand.shapes import link_shapes
 
 MIMIC = '<mimic joint="left_slide"/>'
 JAW = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
-LIMIT = '<limit lower="0" upper="0.05" effort="60" velocity="1"/>'
-MASS = '<mass value="0.05"/>'
 EMPTY = '<model name="{}"><link name="x"/></model>'
 RIGHT = JAWS[JAWS.index('<joint name="right_slide"') : JAWS.index('<joint name="left_end_')]
-FILE = '<geometry><mesh filename="{}"/></geometry>'
 # fmt: off
 #: Of a file of its own: its text, its name, and what is said of it.
 FILES = {
@@ -51,69 +49,10 @@ FILES = {
     "missing mesh of MJCF": ('<mujoco><asset><mesh file="lost.stl"/></asset></mujoco>', "hand.xml",
                              "lost.stl: must be a readable file, got: No such file"),
 }
-#: Of the jaws in URDF: what is replaced, how often (-1: everywhere), and what is said of it.
-URDF = {
-    "missing mesh": (JAW, FILE.format("lost.stl"), 1, "lost.stl: must be a readable file, got"),
-    "mesh of the web": (JAW, FILE.format("https://x.org/a.stl"), 1, "nothing is fetched"),
-    "mesh of another format": (JAW, FILE.format("jaw.step"), 1, r"must be one of .* '\.step'"),
-    "mesh of glTF": (JAW, FILE.format("tip.gltf"), 1, r"gltf: must be one of .* '\.gltf'"),
-    "mesh of no name": (JAW, FILE.format(""), 1, "must be a readable file, got: a folder"),
-    "broken mesh": (JAW, FILE.format("broken.glb"), 1, "mesh broken.glb: must be a valid .glb"),
-    "mesh without triangles": (JAW, FILE.format("empty.obj"), 1,
-                               "mesh empty.obj: must hold triangles, got no faces"),
-    "mesh of an unknown package": (JAW, FILE.format("package://other/jaw.stl"), 1,
-                                   "must lie in a known package: .* --package other=FOLDER"),
-    "loop": ("</robot>", fixed("bridge", "right_jaw", "left_jaw") + "</robot>", -1,
-             "link 'left_jaw'|loop"),
-    "links in a circle": ("</robot>", fixed("bridge", "left_jaw", "mount") + "</robot>", -1,
-                          "one tree of links|loop"),
-    "two trees": ("</robot>", link("other", 0.1, JAW) + "</robot>", -1,
-                  r"must be one tree of links, with one root, got 2 \(.*other\)"),
-    "negative mass": (MASS, '<mass value="-0.05"/>', 1,
-                      "link 'left_jaw' must have a mass of 0 kg or more, got -0.05"),
-    "units in mm": (JAW, '<geometry><box size="20 12 60"/></geometry>', -1,
-                    "must be a hand in metres, got one of 6[0-9] m"),
-    "circle of mimics": (f"{LIMIT}</joint>", f'{LIMIT}<mimic joint="right_slide"/></joint>', 1,
-                         "joint '(left|right)_slide' must follow a joint that leads, got a circle"),
-    "mimic of nothing": (MIMIC, '<mimic joint="thumb"/>', -1,
-                         "'right_slide' must follow a joint that moves, got 'thumb'"),
-    "mimic without motion": (MIMIC, '<mimic joint="left_slide" multiplier="0"/>', -1,
-                             "joint 'right_slide' must follow 'left_slide' by a ratio, got 0"),
-    "multiplier that is no number": (
-        MIMIC, '<mimic joint="left_slide" multiplier="twice"/>', -1,
-        "multiplier of a mimic must be a number, got 'twice'"),
-    "limits the wrong way": ('lower="0" upper="0.05"', 'lower="0.05" upper="0"', 1,
-                             r"must have a lower limit below its upper one, got 0.05\.\.0"),
-    "joints without limits": (LIMIT, "", -1, "must have two fingers that can close from .*, got 0"),
-    "joint without a range": ('upper="0.05"', 'upper="0"', -1,
-                              "must have two fingers that can close from .*, got 0: .* --fingers"),
-    "effort of a placeholder": ('effort="60"', 'effort="0"', -1,
-                                r"the effort of joint '\w+_slide' must be .* --effort N"),
-    "xacro's call": (">\n", '><xacro:finger xmlns:xacro="http://ros.org/xacro"/>\n', 1,
-                     "must be a model without xacro, got '<xacro:finger'"),
-    "xacro's argument": ("</robot>", "<gazebo><p>$(find hand)/x</p></gazebo></robot>", -1,
-                         r"must be a model without xacro, got '\$\(find hand\)/x'"),
-}
-#: And of the jaws in MJCF.
-MJCF = {
-    "includes itself": ("<worldbody>", '<include file="hand.xml"/><worldbody>', -1,
-                        "must be MJCF that MuJoCo reads, got .*already included"),
-    "curve in place of a line": ('"0 1 0 0 0"', '"0 1 2 0 0"', -1,
-                                 "polycoef of joint 'right_slide' must be a line, got a curve"),
-    "shape of a light second": ("0 0.006 0.03", "0 0.006 4294967295", 1,
-                                r"must be a hand in metres, got one of 4\.29e\+09 m"),
-    "equality with a constant": ('joint2="left_slide" ', "", -1,
-                                 "joint 'right_slide' must follow a joint, got an equality with a"),
-    "soft body": ("<equality>", '<deformable><flex name="f" dim="1" body="body left_jaw" '
-                  'element="0 1"/></deformable><equality>', -1,
-                  "must be of rigid bodies, got <flex>"),
-    "ball joint": ("</body>\n  </body>", '<body name="b"><joint name="ball" type="ball"/><geom '
-                   'size="0.01"/></body></body></body>', -1,
-                   "joint 'ball' must be revolute, prismatic or fixed, got ball"),
-    "two roots": ("</worldbody>", '<body name="table"><geom size="1"/></body></worldbody>', -1,
-                  r"must be one tree of links, with one root, got 2 \(body, table\)"),
-}
 # fmt: on
+
+
+TABLE = table("spoilt_models")
 
 
 def changed(text: str, old: str, new: str, count: int = -1) -> str:
@@ -123,8 +62,11 @@ def changed(text: str, old: str, new: str, count: int = -1) -> str:
 
 SPOILT = (
     FILES
-    | {name: (changed(JAWS, *row[:3]), "hand.urdf", row[3]) for name, row in URDF.items()}
-    | {name: (changed(JAWS_MJCF, *row[:3]), "hand.xml", row[3]) for name, row in MJCF.items()}
+    | {name: (changed(JAWS, *row[:3]), "hand.urdf", row[3]) for name, row in TABLE["urdf"].items()}
+    | {
+        name: (changed(JAWS_MJCF, *row[:3]), "hand.xml", row[3])
+        for name, row in TABLE["mjcf"].items()
+    }
 )
 
 

@@ -227,7 +227,6 @@ def test_a_draft_of_mjcf_is_urdf_that_needs_no_mujoco(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mujoco")
-    monkeypatch.setattr("drakegrasp.hand_setup.GRASPS", ())
     text = JAWS_MJCF
     for old, new in mesh_tip(f'vertex="{PLATE}"').items():
         text = text.replace(old, new)

@@ -137,13 +137,9 @@ def placed_at(X_TO, X_OM):
 @pytest.mark.parametrize("single", [False, True], ids=["float64", "float32 rows"])
 @pytest.mark.parametrize("cameras", [1, 4], ids=["one camera", "one per grasp"])
 def test_the_frames_agree(single, cameras):
-    X_TO, X_OM, X_TC = (
-        random_pose(1),
-        random_pose(2),
-        np.array([random_pose(10 + i) for i in range(cameras)]),
-    )
+    X_TO, X_OM, *X_TC = (random_pose(seed) for seed in range(1, 3 + cameras))
     grasps_O = np.array([one_grasp(i) for i in range(4)])
-    given: npt.ArrayLike = X_TC[0] if cameras == 1 else X_TC
+    given: npt.ArrayLike = X_TC[0] if cameras == 1 else np.array(X_TC)
     if single:
         given = pack_pose(given).astype(np.float32)
     X = read_pose(given, "X_TC")
@@ -185,11 +181,7 @@ def test_the_frames_agree(single, cameras):
             np.tile(np.eye(4), (3, 1, 1)),
             "X_TC must be one pose, or one per grasp (2), got 3",
         ),
-        (
-            "camera",
-            np.tile(np.eye(4), (1, 1, 1)),
-            "X_TC must be one pose, or one per grasp (2), got 1",
-        ),
+        ("camera", np.eye(4)[None], "X_TC must be one pose, or one per grasp (2), got 1"),
     ],
 )
 def test_a_frame_out_of_place_is_refused(frame, X, message):

@@ -254,11 +254,7 @@ def camera_of(path):
         (camera_of, b'{"f": 1}', r"camera must be .*got None"),
         (camera_of, b"{", "a JSON file with K, got: "),
         (camera_of, b'{"fx": true, "fy": 300, "cx": 80, "cy": 60}', "camera .*, got truth values"),
-        (
-            camera_of,
-            b'{"K": [1, 0, 80, 0, 1, 60, 0, 0, 1], "d": ["0"]}',
-            "d must be numbers, got text",
-        ),
+        (camera_of, b'{"K": [1, 0, 80, 0, 1, 60, 0, 0, 1], "d": ["0"]}', "d must be numbers, got"),
     ],
 )
 def test_bad_files_are_refused_with_their_name(tmp_path, read, content, said):
