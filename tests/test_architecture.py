@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,32 +19,13 @@ import drakegrasp
 
 PACKAGE = Path(drakegrasp.__file__).parent
 
-#: The rooms, which are folders or single modules; each may import only from those before it, see
-#: docs/explanation/architecture.md. The first is the vocabulary: the other modules at the top.
-ORDER = (
-    "(root)",
-    "runtime",
-    "mesh",
-    "objects",
-    "shapes",
-    "hand",
-    "vision",
-    "simulation",
-    "mjcf",
-    "dataset",
-    "pictures",
-    "hand_setup",
-    "generation",
-    "reach",
-    "page",
-    "cluster",
-    "verification",
-    "protocols",
-    "exchange",
-    "scoring",
-    "api",
-    "cli",
+PAGE = PACKAGE.parent / "docs" / "explanation" / "architecture.md"
+#: The rooms, which are folders or single modules, as the page lists them; each may import only from
+#: those before it. The first is the vocabulary: the other modules at the top.
+_, *_BELOW = re.findall(
+    r"^(\S+)  ", PAGE.read_text().partition("## The rooms")[2].split("```")[1], re.M
 )
+ORDER = ("(root)", *_BELOW)
 #: Folders of data, without code.
 DATA = {"models", "presets"}
 #: What only some places may import, at any depth of their code.

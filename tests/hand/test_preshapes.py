@@ -1,4 +1,4 @@
-"""Preshapes of a hand: which fingers close, where the others stand, and what is stored of it."""
+"""Preshapes of a hand, and fingers that the motor of another finger drives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from helpers.hands import copy_model
+from helpers.hands import SLIDER, copy_model, slider_fingers, write_slider
 from helpers.successes import good, judge
 
 from drakegrasp.config import CandidateConfig, FilterConfig
@@ -18,10 +18,18 @@ from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.filters import Removal
+from drakegrasp.frames import make_pose
 from drakegrasp.generation.attempts import TrialSetup, trial_rows
 from drakegrasp.grasp import unused_fingers
+from drakegrasp.hand.checks import check_couplings
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
-from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.kinematics import (
+    closed_positions,
+    coordinate_limits,
+    fingertip_forces,
+    joint_positions,
+    open_together,
+)
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -29,7 +37,9 @@ from drakegrasp.pictures.still_scene import StillScene
 from drakegrasp.simulation.attempt import Attempt, Source
 from drakegrasp.simulation.candidates import Candidates, palm_attempts
 from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.posture import Posture, start_of
 from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.verification.wrist_solver import fit_wrist, make_postures
 
 PINCH = {
     "name": "pinch",
@@ -188,3 +198,93 @@ def test_bits_say_which_fingers_are_left_out() -> None:
         unused_fingers([0, 1, 6], 3),
         [[False, False, False], [True, False, False], [False, True, True]],
     )
+
+
+OWN, DRIVEN = slider_fingers(60.0, finger="left")
+MOTOR_REFUSALS = {
+    "no such finger": (
+        [OWN, {**DRIVEN, "driven_by": {"finger": "middle"}}],
+        r"fingers.1.driven_by.finger must be .* motor of its own \(left\), got 'middle'"),
+    "each drives the other": (
+        [{**DRIVEN, "name": "left", "driven_by": {"finger": "right"}}, DRIVEN],
+        r"fingers.0.driven_by.finger must be .* \(there is none\), got 'right'"),
+    "a motor of its own as well": (
+        [OWN, {**DRIVEN, "force_limit": 3.0}],
+        "fingers.1.force_limit must be left out with driven_by: the motor is that of finger"),
+    "a rotor of its own": ([OWN, {**DRIVEN, "rotor_inertia": 1e-6}],
+                           "fingers.1.rotor_inertia must be left out"),
+    "it opens while the other closes": (
+        [OWN, {**DRIVEN, "driven_by": {"finger": "left", "ratio": -1.0}}],
+        "fingers.1.driven_by.ratio: .*greater than 0"),
+}  # fmt: skip
+
+
+def shared(tmp_path: Path, ratio: float = 1.0, **changes: object) -> Hand:
+    fingers = slider_fingers(60.0, finger="left", ratio=ratio)
+    return load_hand(write_slider(tmp_path, fingers=fingers, **changes))
+
+
+@pytest.mark.parametrize("case", MOTOR_REFUSALS)
+def test_a_finger_is_driven_by_one_motor(tmp_path: Path, case: str) -> None:
+    fingers, message = MOTOR_REFUSALS[case]
+    with pytest.raises(HandError, match=message):
+        load_hand(write_slider(tmp_path, fingers=fingers))
+
+
+def test_a_finger_that_turns_is_not_driven_by_one_that_slides(tmp_path: Path) -> None:
+    turning = SLIDER.replace(
+        'name="right_slide" type="prismatic"', 'name="right_slide" type="revolute"'
+    )
+    message = (
+        r"fingers.1.driven_by: must be a finger whose closing joint turns, as 'right_slide', "
+        "got 'left'"
+    )
+    with pytest.raises(HandError, match=message):
+        shared(tmp_path, urdf=turning)
+
+
+def test_fingers_of_one_motor_close_in_step(tmp_path: Path) -> None:
+    """The model lets each slide by 40 mm: the one that closes twice as far is at its end first."""
+    hand = shared(tmp_path, ratio=2.0)
+    np.testing.assert_allclose(coordinate_limits(hand)[1:], [[0.0, 0.02], [0.0, 0.04]])
+    np.testing.assert_allclose(closed_positions(hand), [0.02, 0.04])
+    np.testing.assert_allclose(hand.closing_speed, [0.1, 0.2])
+    np.testing.assert_allclose(open_together(hand, [0.015, 0.02]), [0.01, 0.02])
+    np.testing.assert_allclose(open_together(hand, [0.005, 0.02]), [0.005, 0.01])
+
+
+def test_one_motor_presses_with_both_fingers(tmp_path: Path) -> None:
+    """120 N at a motor that moves each finger by as much are 60 N each, by 1 and 2 they are 40."""
+    assert fingertip_forces(shared(tmp_path), "torque") == pytest.approx([60.0, 60.0])
+    assert fingertip_forces(shared(tmp_path, ratio=2.0), "torque") == pytest.approx([40.0, 40.0])
+    assert fingertip_forces(load_hand("franka"), "worm") == pytest.approx([35.0, 35.0])
+
+
+@pytest.mark.parametrize(("q", "own_motors"), [((0.02, 0.02), False), ((0.02, 0.03), True)])
+def test_a_posture_that_the_motor_cannot_reach_gets_motors_of_its_own(
+    tmp_path: Path, q: tuple[float, float], own_motors: bool
+) -> None:
+    start = start_of(Posture(np.eye(4), np.array(q)), shared(tmp_path))
+    assert start.own_motors == own_motors
+    assert start.closing is None or np.ptp(start.closing) == 0.0
+
+
+def test_a_wrist_brings_both_fingers_to_their_points(tmp_path: Path) -> None:
+    """The contacts are 3 mm off the middle: the palm moves, not one of the fingers."""
+    hand = shared(tmp_path)
+    assert make_postures(hand).coordinates.shape[1] == 2
+    p_OQ, outward = np.array([[0.0, -0.017, 0.3], [0.0, 0.023, 0.3]]), np.eye(3)[[1, 1]]
+    outward[0] *= -1.0
+    best = fit_wrist(hand, p_OQ, outward, make_pose(np.eye(3), [0.0, 0.0, 0.5]))[0]
+    assert best.closing[0] == best.closing[1] == pytest.approx(0.02, abs=1e-3)
+    assert best.residual.max() < 5e-4
+
+
+def test_hand_check_asks_for_the_motor_that_the_model_shares(tmp_path: Path) -> None:
+    """Its fingers mimic each other in the URDF."""
+    finding = check_couplings(load_hand(write_slider(tmp_path)))
+    assert not finding.ok
+    assert "'right_slide' must be coupled to 'left_slide' by 1 and 0" in finding.text
+    assert check_couplings(shared(tmp_path)).ok
+    other = check_couplings(shared(tmp_path, ratio=2.0))
+    assert not other.ok

@@ -53,12 +53,6 @@ def test_a_number_that_makes_the_push_too_strong(judge: Judge, numbers: dict[str
     assert verdict.push == 2
 
 
-def test_density_is_as_good_as_the_mass(judge: Judge) -> None:
-    given = judge(mass=None, density=0.1 / EDGE**3)
-    assert given.success
-    assert given.moved == pytest.approx(judge().moved, rel=1e-6)
-
-
 def test_torsion_holds_a_bar_beside_its_middle(judge: Judge, tmp_path: Path) -> None:
     """1 N at 30 mm turns it; the jaws hold 2 x 1.2 N x 0.02 m."""
     bar = box_folder(tmp_path / "bar", EDGE, 0.16, 0.03)
