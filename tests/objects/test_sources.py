@@ -19,15 +19,10 @@ from drakegrasp.objects.sources import find_mesh, find_meshes, load_source, sour
     [
         ("24_mug_final", "mug"),
         ("1_mug_small", "mug"),
-        ("1_mug", "mug"),
         ("30_fruit_juicer_final", "fruit_juicer"),
         ("41_jar_and_lid_final", "jar_and_lid"),
-        ("1_Coffeecup_final", "Coffeecup"),
-        ("mug", "mug"),
         ("mug_final", "mug_final"),
-        ("24", "24"),
         ("24_", "24_"),
-        ("2 große Tasse", "2 große Tasse"),
         ("7_тарелка_a", "тарелка"),
     ],
 )
