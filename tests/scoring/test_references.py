@@ -58,6 +58,14 @@ def test_the_nearest_image_of_a_training_image_is_itself(inputs):
     np.testing.assert_array_equal(references.nearest_image(same), inputs.train_grasps)
 
 
+def test_the_thumb_is_the_finger_that_is_opposed_to_the_others_in_most_grasps(inputs):
+    """In two of three grasps it is the third finger."""
+    y, made = np.array([0.0, 1.0, 0.0]), replace(inputs)
+    normals = np.array([[y, y, -y], [y, y, -y], [-y, y, y]])
+    vars(made)["train_grasps"] = np.hstack([0.0 * normals, normals]).reshape(3, 18)
+    assert made.thumb == 2
+
+
 def test_a_grasp_from_above_closes_level_across_the_object(inputs):
     poses = inputs.data.column("object_props/frame_work2cam_oto")
     for row, grasp in zip(inputs.rows, references.top_down(inputs), strict=True):
