@@ -48,7 +48,7 @@ NAMES_TYPES = {
     *(
         (f"api.{module}", "distributed")
         for module in ("building", "predicting", "scoring", "verifying")
-    ),
+    )
 }
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (
@@ -223,7 +223,4 @@ def test_code_names_a_hand_only_as_a_default() -> None:
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     ]
     named = [(module, text) for module, text in texts if text.lower().startswith("barrett")]
-    assert sorted(named) == [
-        ("config", "barrett"),
-        ("hand.description", "barrett"),
-    ]
+    assert sorted(named) == [("config", "barrett"), ("hand.description", "barrett")]

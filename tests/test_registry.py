@@ -16,13 +16,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import MODELS, hand_names
 from drakegrasp.hand.settings import load_config
 
-KINDS: tuple[registry.Kind, ...] = (
-    "clusters",
-    "exporters",
-    "importers",
-    "protocols",
-    "samplers",
-)
+KINDS: tuple[registry.Kind, ...] = ("clusters", "exporters", "importers", "protocols", "samplers")
 
 
 @pytest.fixture

@@ -52,10 +52,7 @@ def change(path: Path, suffix: str, old: str, new: str) -> None:
 FAULTS = table("spoilt_hands")
 PALM_SHAPE, SPREAD_AXIS = (
     FAULTS[case]["old"]
-    for case in (
-        "palm without a shape",
-        "spread joints that the model turns against each other",
-    )
+    for case in ("palm without a shape", "spread joints that the model turns against each other")
 )
 MIMIC = "<mimic joint='{}'><multiplier>{}</multiplier></mimic>"
 POST = (
@@ -144,8 +141,7 @@ def test_findings_of_a_hand_of_the_package(name: str, golden: Golden) -> None:
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name",
-    [name if name == "franka" else in_second_tier(name) for name in hand_names()],
+    "name", [name if name == "franka" else in_second_tier(name) for name in hand_names()]
 )
 def test_every_hand_of_the_package_passes(name: str) -> None:
     reported: list[Finding] = []

@@ -125,13 +125,7 @@ def test_the_folder_is_complete_by_itself(tmp_path: Path) -> None:
 
 
 def test_answers_override_guesses(tmp_path: Path) -> None:
-    drafted = draft(
-        tmp_path,
-        MITTEN,
-        palm="palm",
-        fingers=("index_far", "thumb_far"),
-        effort=0.5,
-    )
+    drafted = draft(tmp_path, MITTEN, palm="palm", fingers=("index_far", "thumb_far"), effort=0.5)
     tree = yaml.safe_load(drafted.path.read_text())
     assert {finger["fingertip"] for finger in tree["fingers"]} == {"index_far", "thumb_far"}
     limits = [finger["torque_limit"] for finger in tree["fingers"]]

@@ -161,9 +161,7 @@ def test_what_knows_one_preshape_refuses_several(tmp_path: Path) -> None:
     assert load_plain_hand("allegro", "MuJoCo") is load_hand("allegro")
 
 
-def test_exports_leave_the_fingers_that_a_grasp_does_not_use_where_they_are(
-    tmp_path: Path,
-) -> None:
+def test_exports_leave_the_fingers_that_a_grasp_does_not_use_where_they_are(tmp_path: Path) -> None:
     """Neither before the grasp nor in the squeeze; joints of the preshape keep its positions."""
     hand = allegro(tmp_path, ALL, PINCH)
     posed = StillScene(hand)

@@ -32,9 +32,7 @@ def judge(hand: Path, box: ObjectFolder) -> Callable[..., PostureVerdict]:
     """Returns the verdict on a grasp of the box, by DexGraspBench's rules with changed numbers."""
 
     def run(
-        motion: GraspMotion | None = None,
-        thing: ObjectFolder = box,
-        **numbers: Any,
+        motion: GraspMotion | None = None, thing: ObjectFolder = box, **numbers: Any
     ) -> PostureVerdict:
         rules = changed(**numbers)
         return rules.run(ProtocolScene(rules, hand, thing), motion or jaws(0.01))

@@ -181,10 +181,7 @@ def brute_sweep(lookup, path, row: int, config: ScreenConfig) -> tuple[int, bool
 
 @pytest.mark.parametrize(
     "config",
-    [
-        ScreenConfig(),
-        ScreenConfig(clearance=0.0055, reach_margin=0.004, block_margin=0.002),
-    ],
+    [ScreenConfig(), ScreenConfig(clearance=0.0055, reach_margin=0.004, block_margin=0.002)],
     ids=["usual", "other"],
 )
 def test_sweep_finds_what_a_look_at_every_angle_finds(cube, hand, config):
