@@ -2,33 +2,14 @@
 
 from __future__ import annotations
 
+from helpers.tables import table
+
 from drakegrasp.outcomes import Outcome, Stage
-
-PLACED, CLOSED, TRIED = Stage.PLACED, Stage.CLOSED, Stage.TRIED
-
-#: Label, frozen number, last stage with results, whether it says nothing about the grasp.
-TABLE = [
-    ("success", 0, TRIED, False),
-    ("below_table", 1, PLACED, False),
-    ("ray_miss", 2, PLACED, False),
-    ("start_collision", 3, PLACED, False),
-    ("screened", 4, PLACED, False),
-    ("missing_fingertip", 5, CLOSED, False),
-    ("hand_contact", 6, CLOSED, False),
-    ("table_contact", 7, CLOSED, False),
-    ("slipped", 8, TRIED, False),
-    ("dropped", 9, TRIED, False),
-    ("solver_error", 10, PLACED, True),
-    ("timeout", 11, PLACED, True),
-    ("crashed", 12, PLACED, True),
-    ("moved", 15, TRIED, False),
-    ("invalid", 17, PLACED, False),
-    ("partly_held", 18, TRIED, False),
-]
 
 
 def test_outcomes_in_files_are_frozen() -> None:
-    assert [(o.label, o.value, o.stage, o.inconclusive) for o in Outcome] == TABLE
+    found = [[o.label, o.value, o.stage.name, o.inconclusive] for o in Outcome]
+    assert found == table("outcomes")
 
 
 def test_stages_are_ordered_and_frozen() -> None:
