@@ -82,6 +82,8 @@ class Outcome(IntEnum):
         "lost",
         "a fingertip loses contact during the lift; others still hold the object",
     )
+    # Only in scenes of several objects.
+    NEIGHBOUR_HIT = 19, "no grip", "the closing hand presses on another object"
 
     @property
     def label(self) -> str:

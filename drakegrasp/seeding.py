@@ -34,6 +34,7 @@ class Draw(IntEnum):
     DROP = 3  # the orientation in which an object falls
     SCENE = 4  # an object's place, appearance and cameras
     REPEAT = 5  # whether an attempt is repeated
+    CLUTTER = 6  # the objects of a scene, how they fall, and which grasps are tried
 
 
 class Stream:

@@ -15,6 +15,8 @@ from drakegrasp.runtime.files import validate_seal
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 SCENES_FILE = "scenes.hdf5"
+#: File of scenes of several objects, and the folder of its scenes, see `clutter_path`.
+CLUTTER_FILE, CLUTTER_FOLDER = "clutter.hdf5", "clutter"
 MANIFEST_FILE = "manifest.json"
 #: Folder of the files of arms, see `reach_path`.
 REACH_FOLDER = "reach"
@@ -44,6 +46,11 @@ def reach_path(out: Path, name: str) -> Path:
 def reach_names(out: Path) -> list[str]:
     """Return the names of the arms that a dataset has files of."""
     return sorted(path.stem for path in (out / REACH_FOLDER).glob("*.hdf5"))
+
+
+def clutter_path(out: Path, number: int) -> Path:
+    """Return the path of a scene of several objects, by its number."""
+    return out / CLUTTER_FOLDER / f"{number:06d}.h5"
 
 
 def object_files(out: Path, name: str) -> tuple[Path, Path]:

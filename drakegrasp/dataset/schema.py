@@ -637,22 +637,34 @@ SURFACE_POINTS = 4096
 #: Depth [m] of one unit in a depth image of scenes.hdf5.
 DEPTH_UNIT = 1e-4
 
-#: A row per object and resting pose, in `/scenes` of scenes.hdf5. A scene is a list of `o` objects
-#: on the table; at present it has one object.
+#: Row of /objects, and outcome of a grasp, where there is none.
+NO_OBJECT, NOT_TRIED = -1, 255
+#: What a hand meets: nothing, or the table or a wall; otherwise the index of an object.
+HITS_NOTHING, HITS_TABLE = 255, 254
+#: A neighbour that moved or turned by more than this does not count as left in place [m], [rad].
+MOVED_SHIFT, MOVED_TURN = 0.010, float(np.deg2rad(10.0))
+
+#: A row per scene, in `/scenes` of scenes.hdf5, where it is one object in a resting pose, and of
+#: clutter.hdf5, where it has up to `o` objects.
 SCENE_FIELDS: tuple[Field, ...] = (
     Field("split", "uint8", f"{', '.join(f'{i} {name}' for i, name in enumerate(SPLITS))}: by "
           f"object, whatever `split.by` is", limits=(0, len(SPLITS) - 1)),
-    Field("object", "int32", "rows of /objects", "o"),
-    Field("resting", "uint8", "indices of the objects' resting poses", "o"),
-    Field("probability", "float64", "fractions of the drops that ended in them", "o"),
+    Field("object", "int32", "rows of /objects; -1 beyond the last object of the scene", "o"),
+    Field("resting", "uint8", "indices of the objects' resting poses; 255 for an object that lies "
+          "otherwise", "o"),
+    Field("probability", "float64", "fractions of the drops that ended in them", "o", some=True),
     Field("X_TO", "float64", "poses of the objects: resting poses, rotated about Tz and moved "
-          "on the table", "o 12", "m, -", "T"),
+          "on the table, or how they lie among others", "o 12", "m, -", "T", some=True),
     Field("mass", "float64", "masses of the objects; the mass drawn for an attempt may differ",
-          "o", "kg"),
+          "o", "kg", some=True),
     Field("friction_hand", "float64", "effective coefficients of friction between hand and "
-          "objects; may differ in attempts", "o"),
+          "objects; may differ in attempts", "o", some=True),
     Field("friction_table", "float64", "effective coefficients of friction between table and "
-          "objects; may differ in attempts", "o"),
+          "objects; may differ in attempts", "o", some=True),
+    Field("surroundings", "str", "name of the boxes around the objects, see the attribute of the "
+          "file; only in clutter.hdf5", optional=True),
+    Field("seed", "uint64", "state of the random stream of the scene; only in clutter.hdf5",
+          optional=True),
 )
 
 #: A row per camera and scene, in `/views` of scenes.hdf5.
@@ -670,6 +682,9 @@ VIEW_FIELDS: tuple[Field, ...] = (
     *(replace(field, optional=False) for field in CONDITION_FIELDS
       if field.name in ("object_colour", "table_colour", "light_direction", "light_strength",
                         "depth_noise", "depth_seed")),
+    Field("visible_share", "float64", "fraction of each object's outline that nothing hides; NaN "
+          "outside of the image; only in clutter.hdf5", "o", limits=(0, 1), some=True,
+          optional=True),
 )
 
 #: A row per closed hand, in `/grasps` of scenes.hdf5; the grasps of a scene are consecutive.
@@ -677,12 +692,29 @@ SCENE_GRASP_FIELDS: tuple[Field, ...] = (
     Field("scene", "int32", "row of /scenes"),
     Field("object", "uint8", "index of the grasped object in the scene"),
     Field("trial_id", "int64", "row of trials.hdf5"),
-    Field("outcome", "uint8", "verdict, see /trials"),
+    Field("outcome", "uint8", "verdict, see /trials; in clutter.hdf5 of the grasp in its scene, or "
+          "255 if it was not tried there"),
     Field("tested", "bool",
           "whether a lift was tried to a verdict; if not, it is unknown whether it would hold"),
     Field("lifted", "bool", "whether the grasp holds"),
     *_WORDS,
-    Field("kept", "bool", "whether the grasp is a sample of the dataset"),
+    Field("kept", "bool", "whether the grasp is a sample of the dataset; in clutter.hdf5 whether "
+          "it passes the filters in its scene, except those of images and other grasps"),
+    *(replace(field, optional=True, some=True) for field in (
+        Field("free", "bool", "whether neither the open hand, on its straight way of 10 cm and at "
+              "the grasp, nor the closed hand intersects neighbours, walls or table; only in "
+              "clutter.hdf5, as the next five fields"),
+        Field("hit", "uint8", "what the hand intersects first: index of the object in the scene, "
+              "254 table or wall, 255 nothing"),
+        Field("clean", "bool", "whether the grasp is kept, and no neighbour moved by more than "
+              "10 mm or turned by more than 10 degrees"),
+        Field("neighbour", "uint8", "index in the scene of the neighbour that moved most; 255 for "
+              "none"),
+        Field("neighbour_shift", "float64", "largest motion of a neighbour's origin; NaN if not "
+              "tried", unit="m", limits=FROM_0),
+        Field("neighbour_turn", "float64", "largest turn of a neighbour; NaN if not tried",
+              unit="rad", limits=ANGLE),
+    )),
     Field("source", "uint8", "sampler of the palm pose, see /trials", of="source"),
     *(replace(field, of=field.name) for field in ROBUST_FIELDS),
     *_PRESHAPE,

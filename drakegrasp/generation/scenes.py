@@ -67,7 +67,7 @@ from drakegrasp.simulation.attempt import (
 )
 from drakegrasp.simulation.scene_cache import cached_renderer
 from drakegrasp.vision.camera import RING, Lens, draw_viewpoint, fixed_viewpoints, visible_contacts
-from drakegrasp.vision.rendering import Renderer, paint, render
+from drakegrasp.vision.rendering import RenderedView, paint, render
 
 
 def make_scenes(
@@ -124,13 +124,13 @@ def _make_scenes(
         file.attrs.update({key: trials.attributes[key] for key in ("signature", "shards")})
         progress(0, count)
         for done, (own, images) in enumerate(in_order(execute)(make_scenes_of, tasks), start=1):
-            _write_images(file, images, rows["views"], config)
+            write_images(file, images, rows["views"], config)
             for group, columns in own.items():
-                tables.setdefault(group, []).append(_numbered(group, columns, rows))
+                tables.setdefault(group, []).append(numbered(group, columns, rows))
             rows.update({group: len(next(iter(of.values()))) for group, of in own.items()})
             progress(done, count)
         for group, parts in tables.items():
-            _write_table(file, group, parts)
+            write_table(file, group, parts)
         return count_scenes(file)
 
 
@@ -149,19 +149,11 @@ def _with_scenes(config: Config, overrides: Sequence[str]) -> Config:
 def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]:
     """Yield one task per object, in the order of the dataset."""
     columns = trials.columns(("object", "outcome", "time_close"))
-    sample_split = np.full(len(trials), len(SPLITS))
-    with open_samples(out / DATA_FILES["oto"]) as file:
-        for number, split in enumerate(SPLITS):
-            sample_split[file[split]["trial_id"][:]] = number
+    splits, is_sample = find_splits(out, manifest, trials)
 
     # Use all hands that closed, with any outcome, except those for which the simulator failed.
     failed = [outcome for outcome in Outcome if outcome.inconclusive]
     closed = np.isfinite(columns["time_close"]) & ~np.isin(columns["outcome"], failed)
-    present = [
-        set(sample_split[(columns["object"] == i) & (sample_split < len(SPLITS))].tolist())
-        for i in range(len(manifest.objects))
-    ]
-    splits = split_objects(manifest, present)
     for i, entry in enumerate(manifest.objects):
         ids = np.flatnonzero(closed & (columns["object"] == i))
         yield SceneTask(
@@ -171,8 +163,23 @@ def _tasks(out: Path, manifest: Manifest, trials: Trials) -> Iterator[SceneTask]
             config=manifest.config,
             joints=manifest.joints,
             trials={**trials[ids].columns(GRASPS_FOLLOW_FROM)},
-            samples=sample_split[ids] < len(SPLITS),
+            samples=is_sample[ids],
         )
+
+
+def find_splits(
+    out: Path, manifest: Manifest, trials: Trials
+) -> tuple[list[int], npt.NDArray[np.bool_]]:
+    """Return the split of each object, see `split_objects`, and whether each trial is a sample."""
+    sample_split, objects = np.full(len(trials), len(SPLITS)), trials["object"]
+    with open_samples(out / DATA_FILES["oto"]) as file:
+        for number, split in enumerate(SPLITS):
+            sample_split[file[split]["trial_id"][:]] = number
+    is_sample = sample_split < len(SPLITS)
+    present = [
+        set(sample_split[(objects == i) & is_sample].tolist()) for i in range(len(manifest.objects))
+    ]
+    return split_objects(manifest, present), is_sample
 
 
 def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
@@ -209,7 +216,7 @@ def split_objects(manifest: Manifest, present: Sequence[set[int]]) -> list[int]:
 # Writing
 
 
-def _write_images(
+def write_images(
     file: h5py.File, images: Mapping[str, Sequence[bytes]], start: int, config: Config
 ) -> None:
     """Add the packed images of an object's views, of which the first has row `start`."""
@@ -227,7 +234,7 @@ def _write_images(
                 dataset.id.write_direct_chunk((row, *(0,) * len(field.axes)), chunk)
 
 
-def _numbered(group: str, columns: Columns, rows: Mapping[str, int]) -> Columns:
+def numbered(group: str, columns: Columns, rows: Mapping[str, int]) -> Columns:
     """Return columns whose row numbers count from the first row of the file.
 
     Args:
@@ -239,7 +246,7 @@ def _numbered(group: str, columns: Columns, rows: Mapping[str, int]) -> Columns:
     return {name: v + added[name] if name in added else v for name, v in columns.items()}
 
 
-def _write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
+def write_table(file: h5py.File, name: str, parts: Sequence[Columns]) -> None:
     """Write the columns of a group, except the images of views."""
     group = file.require_group(name)
     for field in SCENE_TABLES[name]:
@@ -297,7 +304,7 @@ def make_scenes_of(task: SceneTask) -> tuple[dict[str, Columns], dict[str, list[
     grasps = _grasps(task, prepared, X_TO)
     views, images, visible = _views(task, prepared, X_TO, grasps)
     tables = {
-        "objects": _object(prepared),
+        "objects": object_row(prepared),
         "scenes": _scenes(task, prepared, X_TO),
         "views": views,
         "grasps": grasps,
@@ -319,7 +326,7 @@ def _place(prepared: PreparedObject, resting: int, config: Config) -> Array:
     return X_TO
 
 
-def _object(prepared: PreparedObject) -> Columns:
+def object_row(prepared: PreparedObject) -> Columns:
     """Return the row of /objects."""
     model = prepared.model
     faces = model.visual_faces.astype(np.int64)
@@ -362,7 +369,8 @@ def _views(
         own = np.flatnonzero(grasps["scene"] == k)
         paint(renderer, look.appearance)
         for number, (kind, X_TC) in enumerate(_cameras(task, name, k, X)):
-            depth, mask = _picture(renderer, lens, X, X_TC, images)
+            seen = render(renderer, X, X_TC, lens)
+            depth = picture(seen, images)
             row = {
                 "scene": k,
                 "kind": kind,
@@ -373,7 +381,7 @@ def _views(
 
             # Find the contacts that the camera sees.
             p_TQ, nhat_Q_T = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
-            sees = visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth * DEPTH_UNIT, mask)
+            sees = visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth * DEPTH_UNIT, seen.mask)
             visible["visible"].append(sees)
             visible["view"].append(np.full(len(own), len(numbers["scene"])))
             visible["grasp"].append(own)
@@ -395,17 +403,14 @@ def _cameras(task: SceneTask, name: str, resting: int, X_TO: Array) -> list[tupl
     return [(drawn, draw_viewpoint(stream, X_TO[:3, 3], scenes)) for stream in streams]
 
 
-def _picture(
-    renderer: Renderer, lens: Lens, X_TO: Array, X_TC: Array, images: dict[str, list[bytes]]
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint8]]:
-    """Render a view, add its packed images to lists, and return its depth image and its mask."""
-    seen = render(renderer, X_TO, X_TC, lens)
+def picture(seen: RenderedView, images: dict[str, list[bytes]]) -> npt.NDArray[np.uint16]:
+    """Add the packed images of a view to lists, and return its depth image [DEPTH_UNIT]."""
     far = np.where(np.isfinite(seen.depth), np.rint(seen.depth / DEPTH_UNIT), 0)
     depth = far.astype(np.uint16)
     stored = {"rgb": seen.rgb, "depth": depth, "mask": seen.mask}
     for key, image in stored.items():
         images[key].append(packed_chunk(np.ascontiguousarray(image)[None], 1))
-    return depth, seen.mask
+    return depth
 
 
 def _conditions(look: Conditions, camera: Stream) -> dict[str, Any]:

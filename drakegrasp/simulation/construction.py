@@ -28,7 +28,9 @@ from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddContactMaterial,
     AddRigidHydroelasticProperties,
+    Box,
     CollisionFilterDeclaration,
+    Convex,
     GeometryId,
     GeometrySet,
     InMemoryMesh,
@@ -62,6 +64,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import FINGER_DAMPING, Hand
@@ -71,8 +74,9 @@ from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid, obj_text
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.simulation.attempt import Materials
-from drakegrasp.simulation.scene import Motor, ObjectScene, Scene, joint_limits
+from drakegrasp.simulation.scene import Motor, Neighbour, ObjectScene, Scene, joint_limits
 from drakegrasp.vision.camera import object_colour
 
 #: Mass of each of the three bodies of the wrist [kg]; small compared to the hand's.
@@ -94,12 +98,20 @@ RESOLUTION_HINT = 0.005
 #: rounding errors do not merge any two of them.
 MESHCAT_RATE = 32.0
 
+#: Colour of walls in recordings, R, G, B and opacity.
+WALL_COLOUR = np.array([0.62, 0.64, 0.68, 0.5])
+
 #: Group and name of a shape's coefficient of friction.
 FRICTION = ("material", "coulomb_friction")
 
 
 def build_scene(
-    model: ObjectModel, physics: PhysicsConfig, hand: Hand, *, meshcat: Meshcat | None = None
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    hand: Hand,
+    *,
+    meshcat: Meshcat | None = None,
+    around: Neighbourhood | None = None,
 ) -> Scene:
     """Return the scene of an object, the table and a hand.
 
@@ -115,10 +127,11 @@ def build_scene(
         physics: Materials, solver and time step.
         hand: The hand.
         meshcat: Where to show the scene while it is simulated; the results have the same bits.
+        around: Neighbours and boxes around the object; None if it is alone on the table.
     """
     physics, hand = model.own_physics(physics), within_load(hand, physics.finger_load)
-    own = cache(partial(_with_coarse, model, physics, hand, meshcat, own_motors=True))
-    return replace(_with_coarse(model, physics, hand, meshcat), own_motors=own)
+    build = partial(_with_coarse, model, physics, hand, meshcat, around)
+    return replace(build(), own_motors=cache(partial(build, own_motors=True)))
 
 
 def _with_coarse(
@@ -126,11 +139,12 @@ def _with_coarse(
     physics: PhysicsConfig,
     hand: Hand,
     meshcat: Meshcat | None,
+    around: Neighbourhood | None,
     *,
     own_motors: bool = False,
 ) -> Scene:
     """Return a scene that can build its scene with coarse steps."""
-    build = partial(_build, model, hand=hand, meshcat=meshcat, own_motors=own_motors)
+    build = partial(_build, model, hand=hand, meshcat=meshcat, around=around, own_motors=own_motors)
     scene = build(physics=physics)
     if physics.coarse_steps == 1:
         return scene
@@ -145,6 +159,7 @@ def build_object_scene(
     *,
     meshcat: Meshcat | None = None,
     resting_surface: Solid | None = None,
+    around: Neighbourhood | None = None,
 ) -> ObjectScene:
     """Return the scene of an object and the table; see `build_scene`.
 
@@ -154,16 +169,22 @@ def build_object_scene(
         meshcat: Where to show the scene while it is simulated.
         resting_surface: Surface that meets the table, in {O}; None for the object's
             `resting_surface`.
+        around: Neighbours and boxes around the object; None if it is alone on the table.
     """
     physics = model.own_physics(physics)
-    builder, drawn = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
+    surface = resting_surface or model.resting_surface
+    builder, drawn = _draft(model, physics, surface, meshcat, around)
     drawn["plant"].Finalize()
     _part_surfaces(drawn)
     return ObjectScene(simulator=Simulator(builder.Build()), **drawn)
 
 
 def _draft(
-    model: ObjectModel, physics: PhysicsConfig, resting_surface: Solid, meshcat: Meshcat | None
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    resting_surface: Solid,
+    meshcat: Meshcat | None,
+    around: Neighbourhood | None,
 ) -> tuple[DiagramBuilder, dict[str, Any]]:
     """Return a diagram with the free object and the table, and attributes of `ObjectScene`."""
     # The free object has one surface for the hand and one for the table.
@@ -182,10 +203,13 @@ def _draft(
     _add_surface(plant, object_body, "hand", model.collision_solid, physics)
     table_side = _add_surface(plant, object_body, "table", resting_surface, physics)
     table = _add_table(plant, scene_graph, physics)
+    surrounding = {} if around is None else _add_around(plant, object_body, model, around, physics)
 
     # A recording needs a visual shape.
     if meshcat is not None:
         _add_visual(plant, object_body, model)
+        for neighbour in surrounding.get("neighbours", ()):
+            _add_visual(plant, neighbour.body, neighbour.model)
         rate = MeshcatVisualizerParams(publish_period=1.0 / MESHCAT_RATE)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, rate)
     return builder, {
@@ -196,6 +220,7 @@ def _draft(
         "object": object_body,
         "table_side": table_side,
         "table": table,
+        **surrounding,
     }
 
 
@@ -204,10 +229,11 @@ def _build(
     physics: PhysicsConfig,
     hand: Hand,
     meshcat: Meshcat | None,
+    around: Neighbourhood | None,
     own_motors: bool,
 ) -> Scene:
     # The object on the table, and the hand on its wrist, which follows a trajectory.
-    builder, drawn = _draft(model, physics, model.resting_surface, meshcat)
+    builder, drawn = _draft(model, physics, model.resting_surface, meshcat, around)
     plant, scene_graph = drawn["plant"], drawn["scene_graph"]
     trajectory = builder.AddSystem(
         TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
@@ -253,6 +279,60 @@ def _add_surface(
     text = obj_text(surface.vertices, surface.faces, normals=False)
     mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
     return plant.RegisterCollisionGeometry(body, RigidTransform(), mesh, name, properties)
+
+
+def _add_around(
+    plant: MultibodyPlant,
+    object_body: RigidBody,
+    model: ObjectModel,
+    around: Neighbourhood,
+    physics: PhysicsConfig,
+) -> dict[str, Any]:
+    """Add free neighbours and fixed boxes, and return the attributes of `ObjectScene` about them.
+
+    A neighbour has the surfaces of the object. Drake finds no hydroelastic contact between two
+    rigid meshes, so objects meet each other by a third shape: their convex hull, as compliant as
+    the table. An object in the hollow of another one would therefore be pushed out of it.
+    """
+    neighbours = []
+    for i, (other, X_TN) in enumerate(zip(around.models, around.X_TN, strict=True)):
+        name = f"neighbour_{i}"
+        body = plant.AddRigidBody(
+            name, plant.AddModelInstance(name), object_inertia(other, other.mass)
+        )
+        own = other.own_physics(physics)
+        _add_surface(plant, body, "hand", other.collision_solid, own)
+        _add_surface(plant, body, "table", other.resting_surface, own)
+        _add_hull(plant, body, other, own)
+        neighbours.append(Neighbour(body=body, model=other, X_WN=multiply(X_WT, X_TN)))
+    if neighbours:
+        _add_hull(plant, object_body, model, physics)
+    if not around.boxes:
+        return {"neighbours": tuple(neighbours)}
+
+    # The walls are of the table's material, on a body of their own, see the module.
+    walls = plant.AddRigidBody("walls", plant.AddModelInstance("walls"), SpatialInertia.NaN())
+    plant.WeldFrames(plant.world_frame(), walls.body_frame(), RigidTransform(X_WT))
+    properties = ProximityProperties()
+    AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
+    _add_material(properties, partner_friction(physics.friction_table, physics), physics)
+    for i, box in enumerate(around.boxes):
+        shape, X_TB = Box(*box.size), RigidTransform(box.X_TB)
+        plant.RegisterCollisionGeometry(walls, X_TB, shape, f"wall_{i}", properties)
+        plant.RegisterVisualGeometry(walls, X_TB, shape, f"wall_{i}", WALL_COLOUR)
+    return {"neighbours": tuple(neighbours), "walls": walls}
+
+
+def _add_hull(
+    plant: MultibodyPlant, body: RigidBody, model: ObjectModel, physics: PhysicsConfig
+) -> None:
+    """Add the compliant convex hull by which an object meets its neighbours."""
+    properties = ProximityProperties()
+    AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
+    _add_material(properties, object_friction(physics), physics)
+    text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
+    hull = Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "hull")), 1.0)
+    plant.RegisterCollisionGeometry(body, RigidTransform(), hull, "hull", properties)
 
 
 def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:
@@ -508,12 +588,29 @@ def _of_motors(
 
 
 def _part_surfaces(drawn: dict[str, Any], parts: Sequence[GeometryId] = ()) -> None:
-    """Let the hand's parts meet only one surface of the object, and the table only the other."""
-    geometries = drawn["plant"].GetCollisionGeometriesForBody
-    (hand_side, table_side), slab = geometries(drawn["object"]), geometries(drawn["table"])
+    """Let each of the surfaces of an object meet only its partners.
+
+    Of an object and its neighbours, the first surface meets the hand's parts, the second one the
+    table and the walls, and the hull the hulls of the others.
+    """
+    plant = drawn["plant"]
+    geometries = plant.GetCollisionGeometriesForBody
+    bodies = [drawn["object"], *(each.body for each in drawn.get("neighbours", ()))]
+    surfaces = [geometries(body) for body in bodies]
+    hand_sides, table_sides, hulls = (
+        GeometrySet([own[i] for own in surfaces if len(own) > i]) for i in range(3)
+    )
+    fixed = geometries(drawn["table"])
+    if "walls" in drawn:
+        fixed = [*fixed, *geometries(drawn["walls"])]
     declare = CollisionFilterDeclaration()
-    declare.ExcludeBetween(GeometrySet(hand_side), GeometrySet(slab))
-    declare.ExcludeBetween(GeometrySet(table_side), GeometrySet(parts))
+    declare.ExcludeBetween(hand_sides, GeometrySet(fixed))
+    declare.ExcludeBetween(table_sides, GeometrySet(parts))
+    if len(bodies) > 1:
+        declare.ExcludeWithin(hand_sides).ExcludeWithin(table_sides)
+        declare.ExcludeBetween(hand_sides, table_sides)
+        for others in (hand_sides, table_sides, GeometrySet(parts), GeometrySet(fixed)):
+            declare.ExcludeBetween(hulls, others)
     drawn["scene_graph"].collision_filter_manager().Apply(declare)
 
 

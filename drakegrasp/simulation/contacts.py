@@ -24,7 +24,7 @@ from itertools import pairwise
 import numpy as np
 from pydrake.geometry import ContactSurface, HydroelasticContactRepresentation
 from pydrake.multibody.plant import HydroelasticContactInfo
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.tree import BodyIndex, RigidBody
 
 from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.config import CloseConfig
@@ -33,6 +33,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import posed_links
 from drakegrasp.hand.shapes import link_rims
 from drakegrasp.mesh.surfaces import winding_numbers
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.scene import (
     ObjectScene,
     Scene,
@@ -101,15 +102,29 @@ def bodies_on_object(scene: ObjectScene) -> set[BodyIndex]:
 
     These are the bodies of the contacts of `read_contacts`, without points, normals and areas.
     """
+    return _pressing(scene, forces_on_object(scene))
+
+
+def presses_on_neighbour(scene: Scene) -> bool:
+    """Return whether the hand now presses on a neighbour with more than that force."""
+    hand = hand_bodies(scene)
+    return any(_pressing(scene, forces_on(scene, each.body)) & hand for each in scene.neighbours)
+
+
+def _pressing(scene: ObjectScene, forces: dict[BodyIndex, Array]) -> set[BodyIndex]:
     limit = scene.physics.contact_force
-    forces = forces_on_object(scene)
     return {body for body, force in forces.items() if float(norm(force)) > limit}
 
 
 def forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
     """Return the force (3,) of each body on the object, in {W} [N]: the sum of its patches."""
+    return forces_on(scene, scene.object)
+
+
+def forces_on(scene: ObjectScene, body: RigidBody) -> dict[BodyIndex, Array]:
+    """Return the force (3,) of each other body on a body, as `forces_on_object`."""
     results = scene.plant.get_contact_results_output_port().Eval(scene.context)
-    grasped, forces = scene.object.index(), dict[BodyIndex, Array]()
+    grasped, forces = body.index(), dict[BodyIndex, Array]()
     for i in range(results.num_hydroelastic_contacts()):
         info = results.hydroelastic_contact_info(i)
         surface, force_on_M = info.contact_surface(), np.array(info.F_Ac_W().translational())
@@ -121,41 +136,67 @@ def forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
 
 
 def open_hand_meets(scene: Scene) -> dict[str, list[str]]:
-    """Return the links of the hand that intersect the object and the table, under these keys.
+    """Return the links of the hand that intersect other bodies, by the names of these.
+
+    The names are "object", "table", also for walls, and those of the neighbours' models. Neither
+    fingers that meet each other count, nor the object on the table.
+    """
+    links = hand_meets(scene)
+    bodies = [(scene.object, "object"), (scene.table, "table")]
+    bodies += [(each.body, each.model.name) for each in scene.neighbours]
+    return {name: links[body.index()] for body, name in bodies if body.index() in links}
+
+
+def hand_meets(scene: Scene) -> dict[BodyIndex, list[str]]:
+    """Return the links of the hand that intersect other bodies, by body; walls are the table.
 
     This is a geometry query without a contact solve. Drake returns contact surfaces if surfaces
-    intersect. A part that is completely inside the object has no contact surface, so a point inside
+    intersect. A part that is completely inside an object has no contact surface, so a point inside
     each part is also tested against the object's volume.
     """
-    plant, hand = scene.plant, hand_bodies(scene)
+    plant, hand, meetings = scene.plant, hand_bodies(scene), _meetings(scene)
     query = plant.get_geometry_query_input_port().Eval(scene.context)
+    objects = [(scene.object, scene.model), *((n.body, n.model) for n in scene.neighbours)]
+    for geometry, p in scene.parts:
+        p_WP = (query.GetPoseInWorld(geometry) @ p)[None]
+        meetings += [
+            (_body_of(scene, geometry), body.index())
+            for body, model in objects
+            if is_inside(model, scene.pose(body), p_WP)
+        ]
+
+    found = dict[BodyIndex, set[BodyIndex]]()
+    for pair in meetings:
+        for link, other in (pair, pair[::-1]):
+            if link in hand and other not in hand:
+                found.setdefault(other, set()).add(link)
+    return {
+        other: sorted(plant.get_body(link).name() for link in links)
+        for other, links in found.items()
+    }
+
+
+def object_meets_something(scene: ObjectScene) -> bool:
+    """Return whether the object intersects a neighbour, a wall or the table."""
+    return any(scene.object.index() in pair for pair in _meetings(scene))
+
+
+def _meetings(scene: ObjectScene) -> list[tuple[BodyIndex, BodyIndex]]:
+    """Return the pairs of bodies whose surfaces intersect; walls are the table."""
+    query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
     surfaces, pairs = query.ComputeContactSurfacesWithFallback(
         HydroelasticContactRepresentation.kPolygon
     )
-    meetings = [{_body_of(scene, s.id_M()), _body_of(scene, s.id_N())} for s in surfaces]
-    meetings += [{_body_of(scene, p.id_A), _body_of(scene, p.id_B)} for p in pairs]
-    meetings += [
-        {_body_of(scene, geometry), scene.object.index()}
-        for geometry, p in scene.parts
-        if is_inside(scene, (query.GetPoseInWorld(geometry) @ p)[None])
-    ]
-
-    # Neither fingers that meet each other count, nor the object on the table.
-    found: dict[str, list[str]] = {}
-    for name, body in (("object", scene.object), ("table", scene.table)):
-        links = set[BodyIndex]().union(*(pair for pair in meetings if body.index() in pair)) & hand
-        if links:
-            found[name] = sorted(plant.get_body(link).name() for link in links)
-    return found
+    meetings = [(_body_of(scene, s.id_M()), _body_of(scene, s.id_N())) for s in surfaces]
+    return meetings + [(_body_of(scene, p.id_A), _body_of(scene, p.id_B)) for p in pairs]
 
 
-def is_inside(scene: ObjectScene, p_WP: Array) -> bool:
-    """Return whether any of the points (n, 3) [m] is inside the object's volume.
+def is_inside(model: ObjectModel, X_WO: Array, p_WP: Array) -> bool:
+    """Return whether any of the points (n, 3) [m] is inside the volume of an object at X_WO.
 
     Drake's point distance rejects meshes with very sharp edges; winding numbers work on them.
     """
-    model = scene.model
-    p_OP = transform_points(invert_pose(scene.pose(scene.object)), p_WP)
+    p_OP = transform_points(invert_pose(X_WO), p_WP)
     near = p_OP[np.all(np.abs(p_OP) <= model.half_extents, axis=1)]
     if not len(near):
         return False
@@ -173,6 +214,7 @@ class _Reader:
         self._X_OW = invert_pose(scene.pose(scene.object))
         self._tips = [body.index() for body in scene.fingertips]
         self._hand = hand_bodies(scene)
+        self._neighbours = {each.body.index() for each in scene.neighbours}
         k = len(self._tips)
         self._force_W, self._area = np.zeros((k, 3)), np.zeros(k)
         self._weight, self._penetration = np.zeros(k), np.zeros(k)
@@ -199,6 +241,8 @@ class _Reader:
         force_on_object = force_on_M if grasped == M else -force_on_M
         if other == table:
             self._table_force += force_on_object
+        elif other in self._neighbours:
+            return
         elif other in self._tips:
             self._add_tip_patch(self._tips.index(other), surface, force_on_object, grasped == M)
         else:
@@ -323,8 +367,11 @@ def _read_faces(
 
 
 def _body_of(scene: ObjectScene, geometry_id: object) -> BodyIndex:
+    """Return the body of a shape; walls belong to the table, as their contacts mean the same."""
     inspector = scene.scene_graph.model_inspector()
-    return scene.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id)).index()
+    body = scene.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id))
+    is_wall = scene.walls is not None and body.index() == scene.walls.index()
+    return scene.table.index() if is_wall else body.index()
 
 
 #: Largest step of a joint between two postures whose height is computed [rad or m]. A point 0.3 m

@@ -17,7 +17,7 @@ at the end, the verdict takes precedence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -42,6 +42,8 @@ from drakegrasp.simulation.scene import (
     closing_angles,
     hand_positions,
     move_wrist,
+    neighbour_poses,
+    object_pose,
     palm_pose,
     release,
     transfer_state,
@@ -75,6 +77,7 @@ class Lift:
         moved: Whether the lift ended early because the object moved too far in the hand.
         clearance: Smallest height of the hand above the table's top [m], negative below it; NaN if
             not measured.
+        X_TN: Poses of the n neighbours at the end, (n, 4, 4).
     """
 
     contacts: Contacts
@@ -88,6 +91,7 @@ class Lift:
     turn_released: float
     moved: bool
     clearance: float = np.nan
+    X_TN: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
 
 def lift(scene: Scene, limits: TrialLimits, config: Config, materials: Materials) -> Lift:
@@ -155,7 +159,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config, materials: Materials
         contacts=contacts,
         q=hand_positions(current),
         duration=now - start,
-        X_TO=multiply(invert_pose(X_WT), current.pose(current.object)),
+        X_TO=object_pose(current),
         X_OG=invert_pose(X_GO),
         slip=slip,
         turn=turn,
@@ -163,6 +167,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config, materials: Materials
         turn_released=turn_released,
         moved=moved,
         clearance=clearance.least(),
+        X_TN=neighbour_poses(current),
     )
 
 

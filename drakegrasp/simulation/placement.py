@@ -33,6 +33,9 @@ from drakegrasp.simulation.trial import TrialRecord
 
 #: Largest distance of the object's lowest point from the table at a given pose [m].
 MAX_GAP = 0.005
+#: Poses whose entries differ by less than this are the same, [m] and of unit vectors: a few times
+#: the grid of resting poses.
+SAME_PLACE = 5e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,6 +208,24 @@ def canonical_pose(X_TO: Array) -> Array:
     upright = 1.0 + up[2] if up[2] > 0.0 else axis @ axis / (1.0 - up[2])
     R = np.eye(3) + K + K @ K / upright if upright > 1e-20 else np.diag([1.0, -1.0, -1.0])
     return make_pose(R, [0.0, 0.0, X_TO[2, 3]])
+
+
+def aligned_pose(X_TO: Array, resting_poses: Array) -> Array:
+    """Return the pose (4, 4) at which an object is simulated that stands among others.
+
+    Args:
+        X_TO: Its pose, (4, 4).
+        resting_poses: Its resting poses, (r, 4, 4).
+
+    Returns:
+        The resting pose from which X_TO differs only by yaw and by a shift, so that an object alone
+        gives the bits of its own trials; otherwise `canonical_pose(X_TO)`.
+    """
+    stands = canonical_pose(X_TO)
+    for known in resting_poses:
+        if np.abs(canonical_pose(known) - stands).max() < SAME_PLACE:
+            return np.asarray(known)
+    return stands
 
 
 def _model_of(mesh: trimesh.Trimesh, units: str, config: Config) -> ObjectModel:

@@ -34,7 +34,7 @@ from pydrake.trajectories import BezierCurve, PiecewisePolynomial
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, PhysicsConfig
-from drakegrasp.frames import Array
+from drakegrasp.frames import X_WT, Array, invert_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
@@ -72,6 +72,21 @@ class Motor:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Neighbour:
+    """A free object beside the one that is grasped.
+
+    Attributes:
+        body: Its body.
+        model: The object.
+        X_WN: Pose (4, 4) at the start of each attempt.
+    """
+
+    body: RigidBody
+    model: ObjectModel
+    X_WN: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectScene:
     """An object on the table: a built diagram with its one context.
 
@@ -82,6 +97,8 @@ class ObjectScene:
         object, table: The bodies.
         table_side: The object's surface for contact with the table; a hand uses the other surface.
         physics: The configuration with which the scene was built.
+        neighbours: The free objects beside it.
+        walls: The body of the boxes around it; None if there are none.
     """
 
     model: ObjectModel
@@ -92,6 +109,13 @@ class ObjectScene:
     table_side: GeometryId
     table: RigidBody
     physics: PhysicsConfig
+    neighbours: tuple[Neighbour, ...] = ()
+    walls: RigidBody | None = None
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether there is nothing beside the object."""
+        return not self.neighbours and self.walls is None
 
     @property
     def context(self) -> Context:
@@ -170,10 +194,15 @@ class Scene(ObjectScene):
 
 
 def reset_object(scene: ObjectScene, X_WO: npt.ArrayLike) -> None:
-    """Set the time to zero, and put the object at X_WO (4, 4), free and at rest."""
+    """Set the time to zero, and put the object at X_WO (4, 4), free and at rest.
+
+    Neighbours stand where they stood when the scene was built.
+    """
     scene.simulator.get_mutable_context().SetTime(0.0)
     scene.object.Unlock(scene.context)
-    scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(np.asarray(X_WO)))
+    places = [(scene.object, np.asarray(X_WO)), *((n.body, n.X_WN) for n in scene.neighbours)]
+    for body, X_WB in places:
+        scene.plant.SetFreeBodyPose(scene.context, body, RigidTransform(X_WB))
     scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
     _let_object_meet_table(scene, True)
 
@@ -393,6 +422,17 @@ def hand_joint_names(scene: Scene) -> list[str]:
         scene.instance, add_model_instance_prefix=False, always_add_suffix=False
     )
     return list(names)
+
+
+def object_pose(scene: ObjectScene) -> Array:
+    """Return the present pose X_TO (4, 4) of the object."""
+    return multiply(invert_pose(X_WT), scene.pose(scene.object))
+
+
+def neighbour_poses(scene: ObjectScene) -> Array:
+    """Return the present poses X_TN (n, 4, 4) of the neighbours."""
+    poses = [scene.pose(each.body) for each in scene.neighbours]
+    return multiply(invert_pose(X_WT), np.reshape(poses, (-1, 4, 4)))
 
 
 def palm_pose(scene: Scene) -> Array:

@@ -12,7 +12,7 @@ import gc
 import hashlib
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -28,6 +28,7 @@ from drakegrasp.config import (
 )
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.simulation.attempt import Attempt, disturbed, usual_conditions
 from drakegrasp.simulation.closing import centred
 from drakegrasp.simulation.construction import build_scene
@@ -44,10 +45,11 @@ _lock = threading.Lock()
 
 @dataclass(frozen=True)
 class _Content:
-    """An object, equal to others with the same digest."""
+    """An object and what is around it, equal to others with the same digest."""
 
     digest: str
     model: ObjectModel = field(compare=False)
+    around: Neighbourhood | None = field(compare=False, default=None)
 
 
 def _content(model: ObjectModel, *arrays: npt.NDArray[np.generic] | np.float64) -> _Content:
@@ -64,7 +66,8 @@ def _scenes(content: _Content, physics: PhysicsConfig, hand: Hand) -> Callable[[
     # Diagrams are in reference cycles and own memory that Python does not count, so those that
     # were dropped are freed before others are built.
     gc.collect()
-    return cache(lambda preshape: build_scene(content.model, physics, hand.at(preshape)))
+    around = content.around
+    return cache(lambda shape: build_scene(content.model, physics, hand.at(shape), around=around))
 
 
 @lru_cache(maxsize=KEPT)
@@ -80,7 +83,11 @@ ctypes.pythonapi.Py_IncRef(ctypes.py_object(_renderer))
 
 
 def cached_scene(
-    model: ObjectModel, physics: PhysicsConfig, source: HandSource, preshape: int | None = None
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    source: HandSource,
+    preshape: int | None = None,
+    around: Neighbourhood | None = None,
 ) -> Scene:
     """Return the scene of an object with a hand.
 
@@ -89,12 +96,15 @@ def cached_scene(
         physics: See `build_scene`.
         source: See `load_hand`. A hand whose files have changed is loaded again.
         preshape: Index of a preshape, see `Hand.at`.
+        around: What is around the object, see `build_scene`.
     """
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
-    key = _content(model, *shape, *mass), model.own_physics(physics), load_hand(source)
+    content = _content(model, *shape, *mass)
+    if around is not None:
+        content = replace(content, digest=content.digest + around.digest(), around=around)
     with _lock:
-        return _scenes(*key)(preshape)
+        return _scenes(content, model.own_physics(physics), load_hand(source))(preshape)
 
 
 def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
@@ -110,9 +120,15 @@ def forget_scenes() -> None:
         _scenes.cache_clear()
 
 
-def run_cached(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -> TrialRecord:
+def run_cached(
+    model: ObjectModel,
+    X_TO: Array,
+    attempt: Attempt,
+    config: Config,
+    around: Neighbourhood | None = None,
+) -> TrialRecord:
     """Return the record of an attempt in the cached scene of an object, see `run_in`."""
-    scene = cached_scene(model, config.physics, config.hand_source, attempt.preshape)
+    scene = cached_scene(model, config.physics, config.hand_source, attempt.preshape, around)
     return run_in(scene, X_TO, attempt, config)
 
 

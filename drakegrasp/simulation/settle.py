@@ -21,7 +21,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Draw, Stream, object_key
 from drakegrasp.simulation.construction import build_object_scene
 from drakegrasp.simulation.contacts import table_force
-from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
+from drakegrasp.simulation.scene import ObjectScene, advance, object_pose, reset_object
 
 #: Simulated time between two checks of the object's speed [s].
 CHECK_PERIOD = 0.05
@@ -100,7 +100,7 @@ def find_resting_poses(model: ObjectModel, config: Config) -> list[Resting]:
         stream = Stream(config.seed, object_key(model.name), drop, Draw.DROP)
         # Four normal random numbers, normalised, are a uniform quaternion (Muller 1959).
         try:
-            resting = settle(model, config, _rotation(stream.normal(4)))
+            resting = settle(model, config, rotation_of(stream.normal(4)))
         except MeshError:
             continue
 
@@ -167,7 +167,7 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> 
     speed = float(np.sqrt(2.0 * GRAVITY * fall))
     scene.plant.SetVelocities(scene.context, [0.0, 0.0, 0.0, 0.0, 0.0, -speed])
     scene.simulator.Initialize()
-    stopped = _wait_for_rest(scene, config)
+    stopped = wait_for_rest(scene, config)
 
     # An object that landed on a tip may stick in the table like a nail: raise it and set it down.
     sink = _sink(scene)
@@ -175,11 +175,11 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> 
         if sink <= MAX_SINK:
             break
         _raise(scene, sink)
-        stopped = _wait_for_rest(scene, config) or stopped
+        stopped = wait_for_rest(scene, config) or stopped
         sink = _sink(scene)
 
     # The pose over the table's centre, rounded to the grid.
-    X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
+    X_TO = object_pose(scene)
     if X_TO[2, 3] < 0.0:
         raise MeshError(f"{model.name}: must come to rest on the table, got an object that left it")
     X_TO = snapped(X_TO)
@@ -199,8 +199,12 @@ def settling_surface(model: ObjectModel) -> Solid:
     return subdivide(model.collision_solid, MAX_EDGE, MAX_FACES)
 
 
-def _wait_for_rest(scene: ObjectScene, config: Config) -> bool:
-    """Simulate until the object has been slow for long enough; return whether it was stopped."""
+def wait_for_rest(scene: ObjectScene, config: Config) -> bool:
+    """Simulate until all objects have been slow for long enough; return whether any was stopped.
+
+    Raises:
+        MeshError: If they take too long, or one becomes too fast.
+    """
     # Reject an object that takes too long.
     rules, name = config.settle, scene.model.name
     resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
@@ -232,7 +236,7 @@ def _wait_for_rest(scene: ObjectScene, config: Config) -> bool:
 
 def _sink(scene: ObjectScene) -> float:
     """Return how deep the object's lowest point is in the table [m]; negative above it."""
-    X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
+    X_TO = object_pose(scene)
     return -float(transform_points(X_TO, scene.model.collision_vertices)[:, 2].min())
 
 
@@ -250,13 +254,17 @@ def snapped(X_TO: Array) -> Array:
     Poses that differ by rounding errors become equal in every bit, unless they lie halfway between
     two points of the grid. With a rounding error e, that happens to one pose in POSE_GRID / e.
     """
+    return on_grid(make_pose(X_TO[:3, :3], [0.0, 0.0, X_TO[2, 3]]))
+
+
+def on_grid(X_TO: Array) -> Array:
+    """Return a pose (4, 4) rounded to a fine grid, see `snapped`."""
     # A quaternion and its negative give the same bits below, because each term has two entries.
     wxyz = np.rint(RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz() / POSE_GRID)
-    height = np.rint(X_TO[2, 3] / POSE_GRID) * POSE_GRID
-    return make_pose(_rotation(wxyz), [0.0, 0.0, height])
+    return make_pose(rotation_of(wxyz), np.rint(X_TO[:3, 3] / POSE_GRID) * POSE_GRID)
 
 
-def _rotation(wxyz: Array) -> Array:
+def rotation_of(wxyz: Array) -> Array:
     """Return the rotation (3, 3) of a quaternion (4,) of any length."""
     # Written out, because the bits of SciPy's or Drake's conversion may depend on the CPU.
     w, x, y, z = wxyz / norm(wxyz)
@@ -270,7 +278,8 @@ def _rotation(wxyz: Array) -> Array:
 
 
 def _speeds(scene: ObjectScene) -> tuple[float, float]:
-    """Return the object's linear [m/s] and angular [rad/s] speed."""
-    velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
-    linear = float(norm(velocity.translational()))
-    return linear, float(norm(velocity.rotational()))
+    """Return the largest linear [m/s] and angular [rad/s] speed of the objects."""
+    bodies = [scene.object, *(each.body for each in scene.neighbours)]
+    moving = [scene.plant.EvalBodySpatialVelocityInWorld(scene.context, body) for body in bodies]
+    linear = max(float(norm(velocity.translational())) for velocity in moving)
+    return linear, max(float(norm(velocity.rotational())) for velocity in moving)

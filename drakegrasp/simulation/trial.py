@@ -8,7 +8,7 @@ A failure of the physics is an outcome, not an exception. So is an error in Drak
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +25,7 @@ from drakegrasp.simulation.contacts import (
     ClearanceMonitor,
     Contacts,
     open_hand_meets,
+    presses_on_neighbour,
     read_contacts,
     scrapes,
 )
@@ -39,6 +40,7 @@ from drakegrasp.simulation.scene import (
     finger_speed,
     hand_joint_names,
     hand_positions,
+    neighbour_poses,
     reset_attempt,
     start_limits,
 )
@@ -64,12 +66,14 @@ class Closed:
         duration: Simulated time [s].
         clearance: Smallest height of the hand above the table's top from the start on [m],
             negative below it; NaN if not measured.
+        X_TN: Poses of the n neighbours then, (n, 4, 4).
     """
 
     contacts: Contacts
     q: Array
     duration: float
     clearance: float = np.nan
+    X_TN: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,7 +190,9 @@ def run_attempt(
         if decided is not None:
             return replace(start, outcome=decided)
         limits = start_limits(config)
-        record = _close(scene, start, attempt, config, limits, screening)
+        # Geometry knows where the fingers meet the object, not where they meet something else.
+        known = screening if scene.is_alone else None
+        record = _close(scene, start, attempt, config, limits, known)
         if record.outcome is not Outcome.SUCCESS:
             return record
         return _lift(scene, record, config, limits, _materials_of(scene, attempt))
@@ -200,7 +206,7 @@ def run_attempt(
 
 
 def start_meetings(scene: Scene, X_TO: Array, attempt: Attempt) -> dict[str, list[str]]:
-    """Return the links that intersect "object" or "table" at an attempt's start, by these keys.
+    """Return the links that intersect other bodies at an attempt's start, see `open_hand_meets`.
 
     Args:
         scene: Scene of the object and the hand.
@@ -278,7 +284,10 @@ def _close(
         q=hand_positions(scene),
         duration=scene.time,
         clearance=clearance.least(),
+        X_TN=neighbour_poses(scene),
     )
+    if presses_on_neighbour(scene):
+        return replace(start, closed=closed, outcome=Outcome.NEIGHBOUR_HIT)
 
     # It lifts only an object that is held by all fingertips and nothing else.
     verdict = judge_closed(
@@ -356,9 +365,11 @@ def _follow_path(
 def _checks(
     scene: Scene, limits: TrialLimits, rules: CloseConfig, end: float, clearance: ClearanceMonitor
 ) -> Iterator[None]:
-    """Simulate from check to check of closing fingers until a time [s]."""
+    """Simulate from check to check of closing fingers until a time [s], or a neighbour is hit."""
     # The last check may be before the end by a rounding error, but never by a step.
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(rules.check_period, end - scene.time))
         clearance.look(scene)
+        if presses_on_neighbour(scene):
+            return
         yield

@@ -9,13 +9,16 @@ context, and any other thread silently gets a blank image. A blank image is an e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydrake.common import MemoryFile
 from pydrake.geometry import (
+    Box,
     ClippingRange,
     ColorRenderCamera,
     DepthRange,
@@ -40,11 +43,12 @@ from pydrake.systems.sensors import CameraInfo
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
-from drakegrasp.frames import X_WT, invert_pose, transform_points
+from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.surfaces import obj_text
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import Appearance, Lens, object_colour, unproject, usual_appearance
 
@@ -52,6 +56,8 @@ from drakegrasp.vision.camera import Appearance, Lens, object_colour, unproject,
 BACKGROUND = np.array([0.86, 0.90, 0.94])
 #: Colour of links whose model specifies none; Drake's own default is the colour of an object.
 GREY = np.array([0.70, 0.71, 0.73, 1.0])
+#: Colour of walls, R, G, B and opacity.
+WALL_COLOUR = np.array([0.62, 0.64, 0.68, 1.0])
 #: Intensity of the light at the camera, which never changes.
 CAMERA_LIGHT = 0.6
 #: Message of the error about a blank image.
@@ -61,6 +67,8 @@ BLANK = (
 )
 #: A pixel's depth is corrected by at most this, if it is on a face continued beyond its edge [m].
 FARTHEST = 0.03
+#: Distance below the table at which an object is out of sight [m].
+FAR_BELOW = 50.0
 #: Name of the render engine in a diagram.
 ENGINE = "vtk"
 
@@ -72,7 +80,7 @@ class RenderedView:
     Attributes:
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 [m]; 0 where something is too near, inf where everything is too far.
-        mask: (H, W) uint8, 1 on the object.
+        mask: (H, W) uint8, 1 on the object, 2 on its first neighbour and so on, 0 elsewhere.
         lens: The camera.
     """
 
@@ -92,13 +100,14 @@ class RenderedView:
 
 @dataclass(kw_only=True, eq=False)
 class Renderer:
-    """A diagram that renders one object and the table.
+    """A diagram that renders one object, what is around it, and the table.
 
     Attributes:
         diagram, context: The diagram with its one context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
-        half_extents: Half extents of the object's box, (3,) [m].
+        neighbours: Bodies of the n neighbours.
+        half_extents: Half extents of the boxes of object and neighbours, (1 + n, 3) [m].
         config: The camera.
         appearance: Colours of object and table, and the light; `paint` changes it.
     """
@@ -109,13 +118,16 @@ class Renderer:
     scene_graph: SceneGraph
     object: RigidBody
     table: RigidBody
+    neighbours: tuple[RigidBody, ...]
     half_extents: Array
     config: CameraConfig
     appearance: Appearance
 
 
-def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
-    """Return a renderer of an object's full mesh on the table."""
+def build_renderer(
+    model: ObjectModel, config: CameraConfig, around: Neighbourhood | None = None
+) -> Renderer:
+    """Return a renderer of an object's full mesh on the table, with what is around it."""
     prepare_rendering()
 
     # The object, and the table of the simulation.
@@ -123,9 +135,15 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
     scene_graph.AddRenderer(ENGINE, MakeRenderEngineVtk(_engine_parameters(appearance)))
     body = add_drawn_object(plant, model)
+    models = () if around is None else around.models
+    names = [f"neighbour_{i}" for i in range(len(models))]
+    neighbours = tuple(map(partial(add_drawn_object, plant), models, names))
     (instance,) = make_parser(plant).AddModels(MODELS / "table.urdf")
     table = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), table.body_frame(), RigidTransform(X_WT))
+    for i, box in enumerate(() if around is None else around.boxes):
+        X_WB, shape = RigidTransform(multiply(X_WT, box.X_TB)), Box(*box.size)
+        plant.RegisterVisualGeometry(plant.world_body(), X_WB, shape, f"wall_{i}", WALL_COLOUR)
     plant.Finalize()
     diagram = builder.Build()
     return Renderer(
@@ -135,7 +153,8 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
         scene_graph=scene_graph,
         object=body,
         table=table,
-        half_extents=model.half_extents,
+        neighbours=neighbours,
+        half_extents=np.array([each.half_extents for each in (model, *models)]),
         config=config,
         appearance=appearance,
     )
@@ -190,15 +209,18 @@ def _set_colour(renderer: Renderer, body: RigidBody, colour: Array) -> None:
         graph.AssignRole(context, source, geometry, properties)
 
 
-def add_drawn_object(plant: MultibodyPlant, model: ObjectModel) -> RigidBody:
+def add_drawn_object(
+    plant: MultibodyPlant, model: ObjectModel, name: str = "object"
+) -> RigidBody:
     """Add an object's full mesh to a plant for drawing, and return its body.
 
     Args:
         plant: A plant that is drawn and not simulated; not finalized.
         model: The object.
+        name: Name of the body.
     """
     # The mass properties are arbitrary, because nothing moves by itself.
-    body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
+    body = plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 1.0))
     mesh = drawn_mesh(model.visual_vertices, model.visual_faces, model.name)
     colour = np.array([*object_colour(model.name), 1.0])
     plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "surface", colour)
@@ -212,7 +234,11 @@ def drawn_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, name: str) -> Mesh
 
 
 def render(
-    renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike, lens: Lens | None = None
+    renderer: Renderer,
+    X_TO: npt.ArrayLike,
+    X_TC: npt.ArrayLike,
+    lens: Lens | None = None,
+    X_TN: Sequence[npt.ArrayLike] = (),
 ) -> RenderedView:
     """Return the images of an object at X_TO (4, 4) from a camera at X_TC (4, 4).
 
@@ -221,45 +247,83 @@ def render(
         X_TO: Pose of the object (4, 4).
         X_TC: Pose of the camera (4, 4).
         lens: Lens of the camera; None for the lens of the renderer's configuration.
+        X_TN: Poses of the neighbours, n of (4, 4).
 
     Raises:
         BlankImageError: If the image is blank, which means that OpenGL failed.
     """
-    # Place the object.
-    lens = lens or Lens.of(renderer.config)
-    plant = renderer.plant
-    plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
-    plant.SetFreeBodyPose(plant_context, renderer.object, RigidTransform(multiply(X_WT, X_TO)))
+    lens, poses = lens or Lens.of(renderer.config), [np.asarray(X_TO), *X_TN]
+    query, world, X_WC = _query(renderer, poses, X_TC)
+    core, K = _core(lens), lens.K
+    depth_camera = DepthRenderCamera(core, DepthRange(lens.near, lens.far))
+    colour_camera = ColorRenderCamera(core, False)
 
-    # The camera, given by its pose in the world.
-    X_WC, K = RigidTransform(multiply(X_WT, X_TC)), lens.K
-    core = RenderCameraCore(
+    # Render depth, labels and colour.
+    depth = query.RenderDepthImage(depth_camera, world, X_WC).data[:, :, 0]
+    labels = query.RenderLabelImage(colour_camera, world, X_WC).data[:, :, 0]
+    rgb = query.RenderColorImage(colour_camera, world, X_WC).data[:, :, :3]
+    if not rgb.any() or not depth.any():
+        raise BlankImageError(BLANK)
+    mask = np.zeros(labels.shape, dtype=np.uint8)
+    bodies = (renderer.object, *renderer.neighbours)
+    for number, (body, pose) in enumerate(zip(bodies, poses, strict=True), start=1):
+        own = labels == int(body.index())
+        mask[own] = number
+        X_OC = multiply(invert_pose(pose), X_TC)
+        depth = depth_in_box(depth, own, K, X_OC, renderer.half_extents[number - 1])
+    return RenderedView(rgb=rgb, depth=depth, mask=mask, lens=lens)
+
+
+def outline_sizes(
+    renderer: Renderer, X_TN: Sequence[npt.ArrayLike], X_TC: npt.ArrayLike, lens: Lens
+) -> npt.NDArray[np.int64]:
+    """Return how many pixels each of n objects covers if it is alone on the table, (n,).
+
+    Args:
+        renderer: Renderer of the object and its neighbours, without walls.
+        X_TN: Poses of the object and its neighbours, n of (4, 4).
+        X_TC: Pose of the camera (4, 4).
+        lens: Lens of the camera.
+    """
+    # Objects below the table's slab are not in the image.
+    away, sizes = make_pose(np.eye(3), [0.0, 0.0, -FAR_BELOW]), []
+    camera = ColorRenderCamera(_core(lens), False)
+    bodies = (renderer.object, *renderer.neighbours)
+    for i, (body, X) in enumerate(zip(bodies, X_TN, strict=True)):
+        poses = [np.asarray(X) if j == i else away for j in range(len(bodies))]
+        query, world, X_WC = _query(renderer, poses, X_TC)
+        labels = query.RenderLabelImage(camera, world, X_WC).data[:, :, 0]
+        sizes.append(int((labels == int(body.index())).sum()))
+    return np.array(sizes)
+
+
+def _query(
+    renderer: Renderer, poses: Sequence[Array], X_TC: npt.ArrayLike
+) -> tuple[Any, Any, RigidTransform]:
+    """Place object and neighbours; return what renders, the world's frame and the camera's pose."""
+    plant, bodies = renderer.plant, (renderer.object, *renderer.neighbours)
+    context = plant.GetMyMutableContextFromRoot(renderer.context)
+    for body, pose in zip(bodies, poses, strict=True):
+        plant.SetFreeBodyPose(context, body, RigidTransform(multiply(X_WT, pose)))
+    query = plant.get_geometry_query_input_port().Eval(context)
+    world = plant.GetBodyFrameIdOrThrow(plant.world_body().index())
+    return query, world, RigidTransform(multiply(X_WT, X_TC))
+
+
+def _core(lens: Lens) -> RenderCameraCore:
+    K = lens.K
+    return RenderCameraCore(
         ENGINE,
         # The engine measures the principal point from the corner of pixel (0, 0), not its centre.
         CameraInfo(lens.width, lens.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5),
         ClippingRange(lens.near, lens.far),
         RigidTransform(),
     )
-    depth_camera = DepthRenderCamera(core, DepthRange(lens.near, lens.far))
-    colour_camera = ColorRenderCamera(core, False)
-
-    # Render depth, labels and colour.
-    query = plant.get_geometry_query_input_port().Eval(plant_context)
-    world = plant.GetBodyFrameIdOrThrow(plant.world_body().index())
-    depth = query.RenderDepthImage(depth_camera, world, X_WC).data[:, :, 0]
-    labels = query.RenderLabelImage(colour_camera, world, X_WC).data[:, :, 0]
-    rgb = query.RenderColorImage(colour_camera, world, X_WC).data[:, :, :3]
-    if not rgb.any() or not depth.any():
-        raise BlankImageError(BLANK)
-    mask = (labels == int(renderer.object.index())).astype(np.uint8)
-    X_OC = multiply(invert_pose(X_TO), X_TC)
-    depth = depth_in_box(depth, mask, K, X_OC, renderer.half_extents)
-    return RenderedView(rgb=rgb, depth=depth, mask=mask, lens=lens)
 
 
 def depth_in_box(
     depth: npt.NDArray[np.float32],
-    mask: npt.NDArray[np.uint8],
+    mask: npt.NDArray[Any],
     K: Array,
     X_OC: Array,
     half_extents: Array,

@@ -1,0 +1,215 @@
+"""What stands around a grasped object: walls that never move, and neighbours that do.
+
+Surroundings are a few boxes on the table, by name (`BUILT_IN`) or in a YAML file:
+
+    extent: [0.20, 0.15]     # half lengths in x and y of the area of the objects [m]
+    drops: true              # objects are dropped; false: they stand in their resting poses
+    boxes:
+      - {size: [0.02, 0.34, 0.10], position: [0.21, 0.0, 0.05], yaw_deg: 0.0}
+
+All poses are in the table-top frame {T}. The table itself is always there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.config import Number, Positive, describe_mistake
+from drakegrasp.errors import ConfigError, one_line
+from drakegrasp.foreign_files import read_text
+from drakegrasp.frames import Array, make_pose, rotation_about
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.yaml_text import parse_yaml
+
+#: Thickness of the walls of bin and shelf [m]; a thin compliant wall would let objects through.
+WALL = 0.02
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Box:
+    """A box that never moves.
+
+    Attributes:
+        size: Lengths of its edges, (3,) [m].
+        X_TB: Pose of its centre, (4, 4).
+    """
+
+    size: Array
+    X_TB: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surroundings:
+    """The boxes in which the objects of a scene lie or stand.
+
+    Attributes:
+        name: Its name, or that of its file without suffix.
+        extent: Half lengths in x and y of the area of the objects, (2,) [m]; a scene that has an
+            object with its centre outside is drawn again.
+        drops: Whether objects are dropped; otherwise they stand in their resting poses.
+        boxes: The boxes.
+    """
+
+    name: str
+    extent: Array
+    drops: bool = True
+    boxes: tuple[Box, ...] = ()
+
+    def tree(self) -> dict[str, Any]:
+        """Return the content of its YAML file."""
+        return {
+            "extent": self.extent.tolist(),
+            "drops": self.drops,
+            "boxes": [
+                {
+                    "size": box.size.tolist(),
+                    "position": box.X_TB[:3, 3].tolist(),
+                    "yaw_deg": float(np.degrees(np.arctan2(box.X_TB[1, 0], box.X_TB[0, 0]))),
+                }
+                for box in self.boxes
+            ],
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Neighbourhood:
+    """What is around an object: n movable neighbours, and boxes.
+
+    Attributes:
+        models: The n neighbours.
+        X_TN: Their poses, (n, 4, 4).
+        boxes: The boxes.
+    """
+
+    models: tuple[ObjectModel, ...] = ()
+    X_TN: Array
+    boxes: tuple[Box, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.models or self.boxes)
+
+    def moved(self, X: Array) -> Neighbourhood:
+        """Return it moved by a pose (4, 4) that maps {T} to {T}: a yaw and a shift."""
+        boxes = tuple(replace(box, X_TB=multiply(X, box.X_TB)) for box in self.boxes)
+        return replace(self, X_TN=multiply(X, self.X_TN), boxes=boxes)
+
+    def digest(self) -> str:
+        """Return a hash of meshes, masses and poses."""
+        parts = [self.X_TN, *(part for box in self.boxes for part in (box.size, box.X_TB))]
+        for model in self.models:
+            parts += [model.collision_vertices, model.collision_faces, np.float64(model.mass)]
+        content = hashlib.sha256()
+        for part in parts:
+            content.update(np.ascontiguousarray(part).tobytes())
+        return content.hexdigest()
+
+
+def _walls(inner: tuple[float, float], height: float, sides: Iterable[str]) -> tuple[Box, ...]:
+    """Return walls around an area of the table, by their sides: -x, +x, -y, +y.
+
+    Args:
+        inner: Lengths of the area in x and y [m].
+        height: Height of the walls [m].
+        sides: The sides that have a wall.
+    """
+    boxes = []
+    for side in sides:
+        axis = "xy".index(side[1])
+        size, centre = np.array([*inner, height]) + [2 * WALL, 2 * WALL, 0.0], np.zeros(3)
+        size[axis] = WALL
+        centre[axis] = float(f"{side[0]}1") * 0.5 * (inner[axis] + WALL)
+        centre[2] = 0.5 * height
+        boxes.append(Box(size=size, X_TB=make_pose(np.eye(3), centre)))
+    return tuple(boxes)
+
+
+#: Surroundings by name: the bare table; a container of 60 x 40 cm outside (the Euro size), low
+#: enough for a wide hand; the upper board of a shelf with back and sides, with room for a lift.
+BUILT_IN = {
+    each.name: each
+    for each in (
+        Surroundings(name="table", extent=np.array([0.15, 0.15])),
+        Surroundings(
+            name="bin",
+            extent=np.array([0.28, 0.18]),
+            boxes=_walls((0.56, 0.36), 0.10, ("-x", "+x", "-y", "+y")),
+        ),
+        Surroundings(
+            name="shelf",
+            extent=np.array([0.40, 0.15]),
+            drops=False,
+            boxes=_walls((0.80, 0.30), 0.25, ("-x", "+x", "+y")),
+        ),
+    )
+}
+
+
+def load_surroundings(source: str | Path) -> Surroundings:
+    """Return surroundings by their name, or from a YAML file.
+
+    Raises:
+        ConfigError: If the name is unknown, or the file cannot be used.
+    """
+    if str(source) in BUILT_IN:
+        return BUILT_IN[str(source)]
+    path = Path(source)
+    if not path.is_file():
+        raise ConfigError(
+            f"surroundings must be {', '.join(BUILT_IN)} or a YAML file, got {str(source)!r}"
+        )
+    try:
+        tree = parse_yaml(read_text(path))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(
+            f"{path}: must be YAML, got text that is not ({one_line(error)})"
+        ) from None
+    return surroundings_of(path.stem, tree, str(path))
+
+
+def surroundings_of(name: str, tree: Any, where: str) -> Surroundings:
+    """Return the surroundings of the content of a YAML file.
+
+    Args:
+        name: Their name.
+        tree: The content, see `Surroundings.tree`.
+        where: File of the content, for messages.
+
+    Raises:
+        ConfigError: If the content cannot be used.
+    """
+    try:
+        read = _Tree.model_validate(tree)
+    except ValidationError as error:
+        mistake = describe_mistake(error.errors()[0], whole="surroundings", legal="a known key")
+        raise ConfigError(f"{where}: {mistake}") from None
+    boxes = []
+    for box in read.boxes:
+        turn = rotation_about([0.0, 0.0, 1.0], np.radians(box.yaw_deg))
+        boxes.append(Box(size=np.array(box.size), X_TB=make_pose(turn, box.position)))
+    extent = np.array(read.extent)
+    return Surroundings(name=name, extent=extent, drops=read.drops, boxes=tuple(boxes))
+
+
+class _BoxTree(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    size: tuple[Positive, Positive, Positive]
+    position: tuple[Number, Number, Number]
+    yaw_deg: Number = 0.0
+
+
+class _Tree(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    extent: tuple[Positive, Positive]
+    drops: bool = True
+    boxes: tuple[_BoxTree, ...] = ()
