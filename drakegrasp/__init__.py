@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drakegrasp.api.building import build_dataset, make_benchmark
+    from drakegrasp.api.building import build_clutter, build_dataset, make_benchmark
     from drakegrasp.api.predicting import predict_scenes
     from drakegrasp.api.scoring import score
     from drakegrasp.api.verifying import (
@@ -81,6 +81,7 @@ _HOMES = {
     "Trials": "dataset.trials",
     "Verification": "verification.result",
     "Violation": "dataset.check",
+    "build_clutter": "api.building",
     "build_dataset": "api.building",
     "check_dataset": "dataset.check",
     "cloud_from_depth": "vision.depth_image",
@@ -133,6 +134,7 @@ __all__ = [
     "Trials",
     "Verification",
     "Violation",
+    "build_clutter",
     "build_dataset",
     "check_dataset",
     "cloud_from_depth",

@@ -24,6 +24,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import Decisions, write_decisions
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
+from drakegrasp.objects.surroundings import load_surroundings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -144,6 +145,11 @@ def test_yaml_blocks_are_read(tmp_path: Path) -> None:
             assert (source.name, source.class_name, source.up, source.licence) == tuple(
                 said[key] for key in ("name", "class", "up", "licence")
             )
+        elif "boxes" in content:
+            kinds.append("surroundings")
+            path = tmp_path / "mine.yaml"
+            path.write_text(block.text, encoding="utf-8")
+            assert load_surroundings(path).tree() == content
         elif "fingers" in content:
             kinds.append("hand")
         else:
@@ -151,7 +157,7 @@ def test_yaml_blocks_are_read(tmp_path: Path) -> None:
             path = tmp_path / "mine.yaml"
             path.write_text(block.text, encoding="utf-8")
             assert load_config(str(path)).to_dict() != load_config().to_dict()
-    assert sorted(kinds) == ["config", "hand", "objects"]
+    assert sorted(kinds) == ["config", "hand", "objects", "surroundings"]
 
 
 def meshes(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""Building a dataset or the frozen benchmark on Dask workers.
+"""Building a dataset, scenes of several objects or the frozen benchmark on Dask workers.
 
 These are the functions that `drakegrasp` exports and the command line calls.
 """
@@ -16,13 +16,14 @@ from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.cluster.wire import by_wire
 from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import BUILD_PRESET, Config
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, MANIFEST_FILE
 from drakegrasp.errors import DataError, GraspError, MeshError, counted, listed
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.foreign_files import validate_local
+from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.generation.directory import (
     BUILTIN,
-    BuildDirectory,
     build_config,
     open_directory,
 )
@@ -30,6 +31,7 @@ from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.objects.surroundings import Surroundings, load_surroundings
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
@@ -93,9 +95,13 @@ def build_dataset(
     running = joined(client, workers) if cluster is None else cluster
     config = config or load_config(BUILD_PRESET)
     work = _asked(objects, config, units, manifest, only, postures, read_as)
+    folder, meshes = Path(out).absolute(), work.sources or ()
     with (
-        open_directory(Path(out).absolute(), work.config, work.names) as directory,
-        _workers_of(running, directory, work.sources or (), show=show) as (execute, pool),
+        open_directory(folder, work.config, work.names) as directory,
+        _workers_of(running, folder, directory.manifest.config, meshes, show=show) as (
+            execute,
+            pool,
+        ),
     ):
         sources = work.sources
         if sources is None:
@@ -116,8 +122,9 @@ def build_dataset(
 @contextmanager
 def _workers_of(
     running: AbstractContextManager[Client],
-    directory: BuildDirectory,
-    sources: Sequence[MeshSource],
+    out: Path,
+    config: Config,
+    sources: Sequence[MeshSource] = (),
     *,
     show: bool,
 ) -> Iterator[tuple[Executor, WorkerPool]]:
@@ -125,11 +132,11 @@ def _workers_of(
 
     Args:
         running: Starts the workers, and yields their client.
-        directory: The directory of the build.
+        out: Directory of the dataset.
+        config: Its configuration.
         sources: The meshes that workers read, unless they are in the directory.
         show: Whether to print the address of the dashboard.
     """
-    out, config = directory.out, directory.manifest.config
     with running as client:
         if show:
             sys.stderr.write(dashboard_line(client))
@@ -268,9 +275,63 @@ def make_benchmark(
         )
     with (
         open_directory(folder, config, names) as directory,
-        _workers_of(running, directory, (), show=show) as (execute, pool),
+        _workers_of(running, folder, directory.manifest.config, show=show) as (execute, pool),
     ):
         with progress_bar("objects", "meshes", show=show) as report:
             meshes = find_meshes(write_objects(folder, config, only=only, progress=report))
         sources = [source for source in meshes if source.name in names]
         return build(directory, sources, execute, pool=pool, show=show)
+
+
+def build_clutter(
+    out: str | Path,
+    *,
+    scenes: int = 50,
+    objects: tuple[int, int] = (2, 6),
+    surroundings: str | Path | Surroundings | Sequence[str | Path | Surroundings] = "table",
+    tries: int = 10,
+    client: Client | None = None,
+    show: bool = True,
+    **workers: Unpack[Workers],
+) -> dict[str, dict[str, int]]:
+    """Write OUT/clutter.hdf5, scenes of several objects; the same as `drakegrasp clutter`.
+
+    Scenes that are complete are kept: the same call continues, and more scenes are added to those
+    that are there. Other objects, surroundings or tries replace the file.
+
+    Args:
+        out: Directory of a dataset with samples.
+        scenes: Number of scenes.
+        objects: Smallest and largest number of objects of a scene.
+        surroundings: table, bin, shelf, a YAML file of boxes, or several of these, which scenes
+            take in turn.
+        tries: Number of grasps of each scene, among those that geometry calls free, that are tried.
+        client: A Dask client whose workers do the work, e.g. from `connect`.
+        show: Whether to show progress on standard error.
+        workers: The arguments of `connect`, instead of a client; one process per core if neither
+            is given.
+
+    Returns:
+        The numbers of scenes, objects, views and grasps by split.
+
+    Raises:
+        ConfigError: If a number or the surroundings are not possible.
+        DataError: If there is no dataset, it has no samples or is damaged, another process builds
+            in it, or objects do not come to rest.
+        MachineError: If the workers cannot do the work, or the disk is full.
+    """
+    places = [surroundings] if isinstance(surroundings, str | Path | Surroundings) else surroundings
+    request = ClutterRequest(
+        scenes=scenes,
+        objects=objects,
+        surroundings=[p if isinstance(p, Surroundings) else load_surroundings(p) for p in places],
+        tries=tries,
+    )
+    request.validate()
+    folder = Path(out).absolute()
+    config = read_manifest(folder).config
+    with (
+        _workers_of(joined(client, workers), folder, config, show=show) as (execute, _),
+        progress_bar("clutter", "scenes", show=show) as report,
+    ):
+        return make_clutter(folder, request, execute=execute, restartable=True, progress=report)

@@ -1,4 +1,4 @@
-"""The commands that simulate: `build`, `submit`, which also starts the workers, and `bench-set`."""
+"""The commands that simulate; `submit` also starts the workers of a build."""
 
 from __future__ import annotations
 
@@ -10,7 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 import drakegrasp as dg
-from drakegrasp.cli.arguments import AnyPath, Count, Folder, NewFile, Settings, Tls, What, Workers
+from drakegrasp.cli.arguments import (
+    AnyPath,
+    Count,
+    Dataset,
+    Folder,
+    NewFile,
+    Positive,
+    Settings,
+    Tls,
+    What,
+    Workers,
+)
 from drakegrasp.cli.console import UsageError, same_command, say
 from drakegrasp.errors import counted
 
@@ -125,6 +136,52 @@ def _give_script(cluster: Local, out: Path, file: Path | None) -> None:
         file.write_text(script, encoding="utf-8")
         say(f"{cluster.submission()} {shlex.quote(str(file))}")
     say(f"client: {same_command(('--dry-run',), ('--script',))}")
+
+
+def clutter(
+    out: Dataset,
+    /,
+    *,
+    scenes: Positive = 50,
+    objects: Annotated[str, Parameter(metavar="N|N..M")] = "2..6",
+    surroundings: Annotated[tuple[str, ...], Parameter(metavar="NAME|YAML")] = (),
+    tries: Count = 10,
+    quiet: bool = False,
+    workers: Workers = Workers(),
+) -> None:
+    """Put objects of a dataset together, and try its grasps among them.
+
+    The command writes OUT/clutter.hdf5: scenes of several objects at rest, their views with a mask
+    of each object, and all samples of the objects in them. Geometry decides which grasps are free,
+    and some of these are tried in simulation among movable neighbours. The same command continues;
+    more scenes keep those that are there.
+
+    Args:
+        out: Directory of the dataset.
+        scenes: Number of scenes.
+        objects: Number of objects of a scene, or its range.
+        surroundings: table, bin, shelf, or a YAML file of boxes; given several times, scenes take
+            them in turn. [default: table]
+        tries: Number of free grasps of each scene that are tried.
+        quiet: Show no progress.
+    """
+    from drakegrasp.dataset.paths import CLUTTER_FILE
+
+    low, _, high = objects.partition("..")
+    if not low.isdecimal() or not (high or low).isdecimal():
+        raise UsageError(f"--objects must be a number or a range such as 2..6, got {objects!r}")
+    made = dg.build_clutter(
+        out,
+        scenes=scenes,
+        objects=(int(low), int(high or low)),
+        surroundings=surroundings or "table",
+        tries=tries,
+        **workers.asked(),
+        show=not quiet,
+    )
+    for split, row in made.items():
+        say(f"{split}: {counted(row['scenes'], 'scene')}, {counted(row['grasps'], 'grasp')}")
+    say(str(out / CLUTTER_FILE))
 
 
 def bench_set(

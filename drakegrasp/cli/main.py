@@ -24,6 +24,10 @@ COMMANDS = {
     "assemble": ("datasets:assemble", "Filter and split again, without simulating."),
     "merge": ("datasets:merge", "Merge several datasets that were built separately."),
     "scenes": ("datasets:scenes", "Render views of training scenes, independent of grasps."),
+    "clutter": (
+        "build:clutter",
+        "Put objects of a dataset together, and try its grasps among them.",
+    ),
     "reach": ("reach:reach", "Ask whether an arm gets its hand to the samples."),
     "check": ("datasets:check", "Check every invariant of a dataset."),
     "stats": ("datasets:stats", "Count outcomes, how well grasps hold, and samples."),
@@ -42,7 +46,7 @@ USAGES = {
     "score": "--dataset FILE [OPTIONS] [PREDICTIONS]...",
 }
 #: Commands that the same words continue after Ctrl-C.
-RESUMABLE = ("build", "submit", "bench-set")
+RESUMABLE = ("build", "submit", "clutter", "bench-set")
 
 
 def _version() -> str:

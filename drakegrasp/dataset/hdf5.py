@@ -413,7 +413,8 @@ def _column(group: h5py.Group, field: Field, rows: slice, fields: Sequence[Field
         path = f"{group.name}/{field.name}"
         raise DataError(f"{group.file.filename}: {path} must be there, got none")
     (count, *_) = next(each.shape for each in group.values() if isinstance(each, h5py.Dataset))
-    return field.empty(len(range(count)[rows]), sizes_in(group, fields))
+    sizes = {**dict.fromkeys(LETTERS, 0), **sizes_in(group, fields)}
+    return field.empty(len(range(count)[rows]), sizes)
 
 
 def _stored(group: h5py.Group, name: str, rows: slice, *, text: bool = False) -> AnyArray:

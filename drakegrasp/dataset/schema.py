@@ -169,7 +169,9 @@ class Field:
         return source
 
     def empty(self, count: int, sizes: Mapping[str, int]) -> npt.NDArray[np.generic]:
-        """Return an array of `count` rows without values: NaN, 0 or False."""
+        """Return an array of `count` rows without values: NaN, 0, False or an empty text."""
+        if self.dtype == "str":
+            return np.full(count, "", dtype=object)
         fill = np.nan if np.dtype(self.dtype).kind == "f" else 0
         return np.full((count, *self.row_shape(sizes)), fill, dtype=self.dtype)
 

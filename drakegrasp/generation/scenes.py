@@ -361,7 +361,7 @@ def _views(
     """Return the rows of /views without their images, the images, and the rows of /visible."""
     config, name = task.config, prepared.model.name
     lens, renderer = Lens.of(config.scenes), cached_renderer(prepared.model, config.camera)
-    numbers: dict[str, list[Any]] = {f.name: [] for f in VIEW_FIELDS if not f.sample}
+    rows = list[dict[str, Any]]()
     images: dict[str, list[bytes]] = {f.name: [] for f in VIEW_FIELDS if f.sample}
     visible: dict[str, list[AnyArray]] = {"view": [], "grasp": [], "visible": []}
     for k, X in enumerate(X_TO):
@@ -383,12 +383,11 @@ def _views(
             p_TQ, nhat_Q_T = (grasps[key][own] for key in ("p_TQ", "nhat_Q_T"))
             sees = visible_contacts(p_TQ, nhat_Q_T, X_TC, lens.K, depth * DEPTH_UNIT, seen.mask)
             visible["visible"].append(sees)
-            visible["view"].append(np.full(len(own), len(numbers["scene"])))
+            visible["view"].append(np.full(len(own), len(rows)))
             visible["grasp"].append(own)
-            for key, values in numbers.items():
-                values.append(row[key])
+            rows.append(row)
 
-    columns = {key: np.array(values) for key, values in numbers.items()}
+    columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
     return columns, images, {key: np.concatenate(parts) for key, parts in visible.items()}
 
 

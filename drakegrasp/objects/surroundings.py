@@ -104,7 +104,9 @@ class Neighbourhood:
 
     def digest(self) -> str:
         """Return a hash of meshes, masses and poses."""
-        parts = [self.X_TN, *(part for box in self.boxes for part in (box.size, box.X_TB))]
+        parts: list[Any] = [self.X_TN]
+        for box in self.boxes:
+            parts += [box.size, box.X_TB]
         for model in self.models:
             parts += [model.collision_vertices, model.collision_faces, np.float64(model.mass)]
         content = hashlib.sha256()
@@ -124,7 +126,8 @@ def _walls(inner: tuple[float, float], height: float, sides: Iterable[str]) -> t
     boxes = []
     for side in sides:
         axis = "xy".index(side[1])
-        size, centre = np.array([*inner, height]) + [2 * WALL, 2 * WALL, 0.0], np.zeros(3)
+        size = np.array([inner[0] + 2 * WALL, inner[1] + 2 * WALL, height])
+        centre = np.zeros(3)
         size[axis] = WALL
         centre[axis] = float(f"{side[0]}1") * 0.5 * (inner[axis] + WALL)
         centre[2] = 0.5 * height

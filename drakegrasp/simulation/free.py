@@ -34,8 +34,7 @@ def first_hit(scene: Scene, X_TO: Array, attempt: Attempt, q_closed: Array) -> B
     X_WO = multiply(X_WT, X_TO)
     X_WG = multiply(X_WO, attempt.X_OG)
     q_open = None if attempt.path is None else attempt.path[0]
-    shape = {"spread": attempt.spread, "closing": attempt.closing}
-    reset_attempt(scene, X_WO, X_WG, **shape, q=q_open)
+    reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing, q=q_open)
 
     # The wrist slides along the axes of {W}, so the way is a motion of its joints.
     for back in np.linspace(APPROACH, 0.0, round(APPROACH / SPACING) + 1):
@@ -44,7 +43,7 @@ def first_hit(scene: Scene, X_TO: Array, attempt: Attempt, q_closed: Array) -> B
             joint.set_translation(scene.context, float(p))
         if (met := _met(scene)) is not None:
             return met
-    reset_attempt(scene, X_WO, X_WG, **shape, q=q_closed)
+    reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, q=q_closed)
     return _met(scene)
 
 

@@ -16,14 +16,16 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import ConfigError, GraspError, MeshError
-from drakegrasp.frames import Array, make_pose, read_pose, transform_points
+from drakegrasp.frames import Array, invert_pose, make_pose, read_pose, transform_points
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.mesh.loading import clean_triangles
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import UNITS, find_mesh, validate_units
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempts import make_posture
 from drakegrasp.simulation.posture import Posture, start_of
@@ -47,16 +49,25 @@ class PlacedObject:
         X_TO: Pose in the table-top frame, (4, 4).
         config: The configuration with which the object was prepared and dropped; by default that
             of `load_config()`.
+        around: Neighbours and walls around it; None if it is alone on the table.
     """
 
     model: ObjectModel
     X_TO: Array
     config: Config = field(default_factory=load_config)
+    around: Neighbourhood | None = None
 
     @cached_property
     def X_TO_simulated(self) -> Array:
         """Pose (4, 4) moved to the table's centre, without yaw; verdicts depend on neither."""
         return canonical_pose(self.X_TO)
+
+    @property
+    def around_simulated(self) -> Neighbourhood | None:
+        """What is around the object at `X_TO_simulated`."""
+        if self.around is None:
+            return None
+        return self.around.moved(multiply(self.X_TO_simulated, invert_pose(self.X_TO)))
 
     def __repr__(self) -> str:
         model, z = self.model, self.X_TO[2, 3]
@@ -151,7 +162,7 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
     )
     checked = make_posture(hand, posture.X_OG, *q, preshape=posture.preshape)
     start = start_of(checked, hand)
-    return run_cached(placed.model, placed.X_TO_simulated, start, config)
+    return run_cached(placed.model, placed.X_TO_simulated, start, config, placed.around_simulated)
 
 
 def config_for(mesh: object, config: Config | None) -> Config:

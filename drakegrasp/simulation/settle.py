@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError, first_line
-from drakegrasp.frames import GRAVITY, X_WT, Array, invert_pose, make_pose, transform_points
+from drakegrasp.frames import GRAVITY, X_WT, Array, make_pose, transform_points
 from drakegrasp.mesh.remeshing import subdivide
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.objects.model import ObjectModel

@@ -147,7 +147,8 @@ def _run(placed: PlacedObject, fit: WristFit, config: Config) -> tuple[Attempt, 
         margin = share * np.deg2rad(config.verify.open_margin_deg) * hand.closing_unit
         closing = np.maximum(fit.closing - margin, least)
         pregrasp = Attempt(X_OG=fit.X_OG, spread=fit.spread, closing=closing)
-        trial = run_cached(placed.model, placed.X_TO_simulated, pregrasp, config)
+        at = placed.X_TO_simulated
+        trial = run_cached(placed.model, at, pregrasp, config, placed.around_simulated)
         if trial.outcome is not Outcome.START_COLLISION:
             break
     return pregrasp, trial
@@ -217,7 +218,8 @@ def _judged(verdict: Verification) -> Verification:
     message = trial.message
     if trial.outcome is Outcome.START_COLLISION:
         about = verdict.config.physics, verdict.config.hand_source, start.preshape
-        met = start_meetings(cached_scene(placed.model, *about), placed.X_TO_simulated, start)
+        scene = cached_scene(placed.model, *about, placed.around_simulated)
+        met = start_meetings(scene, placed.X_TO_simulated, start)
         message = "; ".join(f"{', '.join(links)} in the {other}" for other, links in met.items())
     reason = trial.outcome.text + (f": {message}" if message else "")
     return replace(verdict, outcome=trial.outcome, reason=reason)

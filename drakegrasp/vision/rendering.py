@@ -209,9 +209,7 @@ def _set_colour(renderer: Renderer, body: RigidBody, colour: Array) -> None:
         graph.AssignRole(context, source, geometry, properties)
 
 
-def add_drawn_object(
-    plant: MultibodyPlant, model: ObjectModel, name: str = "object"
-) -> RigidBody:
+def add_drawn_object(plant: MultibodyPlant, model: ObjectModel, name: str = "object") -> RigidBody:
     """Add an object's full mesh to a plant for drawing, and return its body.
 
     Args:
@@ -238,7 +236,7 @@ def render(
     X_TO: npt.ArrayLike,
     X_TC: npt.ArrayLike,
     lens: Lens | None = None,
-    X_TN: Sequence[npt.ArrayLike] = (),
+    X_TN: Sequence[Array] | Array = (),
 ) -> RenderedView:
     """Return the images of an object at X_TO (4, 4) from a camera at X_TC (4, 4).
 
@@ -247,7 +245,7 @@ def render(
         X_TO: Pose of the object (4, 4).
         X_TC: Pose of the camera (4, 4).
         lens: Lens of the camera; None for the lens of the renderer's configuration.
-        X_TN: Poses of the neighbours, n of (4, 4).
+        X_TN: Poses of the neighbours, (n, 4, 4).
 
     Raises:
         BlankImageError: If the image is blank, which means that OpenGL failed.
@@ -275,13 +273,13 @@ def render(
 
 
 def outline_sizes(
-    renderer: Renderer, X_TN: Sequence[npt.ArrayLike], X_TC: npt.ArrayLike, lens: Lens
+    renderer: Renderer, X_TN: Array, X_TC: npt.ArrayLike, lens: Lens
 ) -> npt.NDArray[np.int64]:
     """Return how many pixels each of n objects covers if it is alone on the table, (n,).
 
     Args:
         renderer: Renderer of the object and its neighbours, without walls.
-        X_TN: Poses of the object and its neighbours, n of (4, 4).
+        X_TN: Poses of the object and its neighbours, (n, 4, 4).
         X_TC: Pose of the camera (4, 4).
         lens: Lens of the camera.
     """

@@ -131,13 +131,13 @@ def test_object_falls_from_its_own_origin_and_a_tall_one_from_the_table(
 ):
     """A cube of 100 mm falls by 0.25 m; one of 800 mm does not fall. It lands with v^2 = 2 g h."""
     landing = []
-    wait = settle_module._wait_for_rest
+    wait = settle_module.wait_for_rest
 
     def watch(scene: ObjectScene, config: Config) -> bool:
         landing.append(scene.plant.GetVelocities(scene.context)[5])
         return wait(scene, config)
 
-    monkeypatch.setattr(settle_module, "_wait_for_rest", watch)
+    monkeypatch.setattr(settle_module, "wait_for_rest", watch)
     settle(as_dropped(trimesh.creation.box([side] * 3)), config)
     assert landing[0] == pytest.approx(-np.sqrt(2.0 * 9.81 * fall), abs=1e-6)
 
@@ -182,7 +182,7 @@ def test_object_that_left_the_table_is_refused(config: Config, monkeypatch: pyte
         settle_module._raise(scene, -1.0)
         return False
 
-    monkeypatch.setattr(settle_module, "_wait_for_rest", fall)
+    monkeypatch.setattr(settle_module, "wait_for_rest", fall)
     monkeypatch.setattr(settle_module, "_sink", lambda _: 0.0)
     with pytest.raises(MeshError, match="must come to rest on the table, got an object that left"):
         settle(as_dropped(trimesh.creation.box([0.05] * 3)), config)

@@ -172,7 +172,7 @@ def test_points_inside_of_a_real_mesh_with_needles_are_found(name, g3db, config)
     rng = np.random.default_rng(0)
     p_OP = rng.uniform(-1.0, 1.0, (400, 3)) * model.half_extents
     p_WP = transform_points(X_WT @ standing(model), p_OP)
-    found = np.array([is_inside(scene, p[None]) for p in p_WP])
+    found = np.array([is_inside(scene.model, scene.pose(scene.object), p[None]) for p in p_WP])
     by_rays = model.collision.contains(p_OP)
     assert 0 < found.sum() < len(found)
     assert np.mean(found == by_rays) > 0.99

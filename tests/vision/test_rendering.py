@@ -174,7 +174,9 @@ def test_depth_beyond_the_box_moves_along_its_ray() -> None:
 
 def test_rendered_depths_are_within_the_box(renderer: Renderer) -> None:
     """Told that the object is smaller, the renderer moves the +x face to the smaller box's."""
-    seen = render(replace(renderer, half_extents=HALF - [0.005, 0.0, 0.0]), X_TO, facing_x(0.25))
+    seen = render(
+        replace(renderer, half_extents=(HALF - [0.005, 0.0, 0.0])[None]), X_TO, facing_x(0.25)
+    )
     assert seen.image[3][seen.mask == 1].min() == pytest.approx(0.255, abs=1e-6)
 
 

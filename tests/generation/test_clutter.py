@@ -1,0 +1,121 @@
+"""clutter.hdf5: the same bytes whoever makes it and however often it is killed, and its labels."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.paths import CLUTTER_FOLDER, clutter_path
+from drakegrasp.dataset.schema import HITS_NOTHING, NOT_TRIED
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.generation.clutter import ClutterRequest, make_clutter
+from drakegrasp.objects.surroundings import load_surroundings
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import processes
+
+pytestmark = pytest.mark.sim
+
+
+def asked(scenes: int = 2, low: int = 1, high: int = 2, *, tries: int = 3) -> ClutterRequest:
+    around = [load_surroundings(name) for name in ("table", "bin")]
+    return ClutterRequest(scenes=scenes, objects=(low, high), surroundings=around, tries=tries)
+
+
+@pytest.fixture(scope="module")
+def cluttered(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = Path(shutil.copytree(small_dataset, tmp_path_factory.mktemp("clutter") / "out"))
+    make_clutter(out, asked())
+    return out
+
+
+def test_bytes_depend_neither_on_workers_nor_on_what_was_there(cluttered: Path) -> None:
+    """One scene is there, one was cut off, one is of another request, and one is new."""
+    before = (cluttered / "clutter.hdf5").read_bytes()
+    whole = clutter_path(cluttered, 1)
+    whole.write_bytes(whole.read_bytes()[:-100])
+    with processes(2) as execute:
+        make_clutter(cluttered, asked(), execute=execute)
+    assert (cluttered / "clutter.hdf5").read_bytes() == before
+
+    make_clutter(cluttered, asked(tries=0))
+    with h5py.File(cluttered / "clutter.hdf5") as file:
+        assert (file["grasps/outcome"][:] == NOT_TRIED).all()
+    make_clutter(cluttered, asked())
+    assert (cluttered / "clutter.hdf5").read_bytes() == before
+
+
+def test_every_sample_of_an_object_is_a_grasp_and_moves_with_it(cluttered: Path) -> None:
+    samples = Trials(cluttered).where(kept=True)
+    names = samples["object_name"]
+    with h5py.File(cluttered / "clutter.hdf5") as file:
+        grasps, scenes = file["grasps"], file["scenes"]
+        known = file["objects/name"].asstr()[:]
+        place, scene = grasps["object"][:], grasps["scene"][:]
+        objects = scenes["object"][:][scene, place]
+        for number in range(len(scenes["split"])):
+            there = scenes["object"][number]
+            due = sum((names == known[i]).sum() for i in there if i >= 0)
+            assert (scene == number).sum() == due
+        assert (
+            known[objects] == names[np.searchsorted(samples.trial_ids, grasps["trial_id"])]
+        ).all()
+        X_TO = scenes["X_TO"][:][scene, place].reshape(-1, 3, 4)
+        X_TG = grasps["X_TG"][:].reshape(-1, 3, 4)
+        p_OG = np.einsum("nji,nj->ni", X_TO[:, :, :3], X_TG[:, :, 3] - X_TO[:, :, 3])
+        X_OG = samples["X_OG"].reshape(-1, 3, 4)
+        due = X_OG[np.searchsorted(samples.trial_ids, grasps["trial_id"]), :, 3]
+    np.testing.assert_allclose(p_OG, due, atol=1e-6)
+
+
+def test_labels_of_geometry_and_of_trials_agree_with_each_other(cluttered: Path) -> None:
+    with h5py.File(cluttered / "clutter.hdf5") as file:
+        grasps = {name: data[:] for name, data in file["grasps"].items()}
+        share = file["views/visible_share"][:]
+    tried = grasps["outcome"] != NOT_TRIED
+    assert tried.any() and grasps["free"][tried].all()
+    assert (grasps["free"] == (grasps["hit"] == HITS_NOTHING)).all()
+    assert (grasps["lifted"] == (grasps["outcome"] == Outcome.SUCCESS)).all()
+    assert not (grasps["kept"] & ~grasps["lifted"]).any()
+    assert not (grasps["clean"] & ~grasps["kept"]).any()
+    moved = np.nan_to_num(grasps["neighbour_shift"])
+    assert (moved[grasps["clean"]] <= 0.01).all()
+    assert np.nanmin(share) >= 0.0 and np.nanmax(share) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        (asked(scenes=0), "scenes must be at least 1, got 0"),
+        (asked(tries=-1), "tries must be at least 0, got -1"),
+        (asked(low=3, high=2), r"objects must be a range within 1 to 20, got 3\.\.2"),
+    ],
+)
+def test_impossible_requests_are_refused(
+    cluttered: Path, request_: ClutterRequest, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_clutter(cluttered, request_)
+
+
+def test_objects_without_room_and_sets_without_samples_are_refused(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    """In one line; nothing half-written is left."""
+    small = tmp_path / "small.yaml"
+    small.write_text("extent: [0.001, 0.001]\ndrops: false\n")
+    out = Path(shutil.copytree(small_dataset, tmp_path / "out"))
+    crowded = ClutterRequest(scenes=1, objects=(2, 2), surroundings=[load_surroundings(small)])
+    with pytest.raises(DataError, match=r"scene 0: its objects must come to rest in the small, in"):
+        make_clutter(out, crowded)
+    assert not (out / "clutter.hdf5").exists()
+    assert not list((out / CLUTTER_FOLDER).glob("*"))
+
+    assemble(out, rejected=Trials(out).where(kept=True).trial_ids.tolist())
+    with pytest.raises(DataError, match="must have samples to be grasped among others, got none"):
+        make_clutter(out, asked())
