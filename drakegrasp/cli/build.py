@@ -149,7 +149,7 @@ def clutter(
     quiet: bool = False,
     workers: Workers = Workers(),
 ) -> None:
-    """Put objects of a dataset together, and try its grasps among them.
+    """Put objects of a dataset together, and try grasps among them.
 
     The command writes OUT/clutter.hdf5: scenes of several objects at rest, their views with a mask
     of each object, and all samples of the objects in them. Geometry decides which grasps are free,

@@ -26,7 +26,7 @@ COMMANDS = {
     "scenes": ("datasets:scenes", "Render views of training scenes, independent of grasps."),
     "clutter": (
         "build:clutter",
-        "Put objects of a dataset together, and try its grasps among them.",
+        "Put objects of a dataset together, and try grasps among them.",
     ),
     "reach": ("reach:reach", "Ask whether an arm gets its hand to the samples."),
     "check": ("datasets:check", "Check every invariant of a dataset."),
