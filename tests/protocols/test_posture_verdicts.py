@@ -249,7 +249,11 @@ def test_object_without_parts_or_volume_is_refused(tmp_path: Path, assets: Path)
         read_object_folder(tmp_path / "none", 1.0)
     one, half = (read_object_folder(assets / "box", scale).volume for scale in (1.0, 0.5))
     assert half == pytest.approx(one / 8.0)
-    (assets / "box/info/simplified.json").write_text("{}")
+    info = assets / "box/info/simplified.json"
+    said = json.loads(info.read_text())
+    info.write_text(json.dumps(said | {"mass": 8.0 * said["mass"], "scale": 2.0 * said["scale"]}))
+    assert read_object_folder(assets / "box", 1.0).volume == pytest.approx(one)
+    info.write_text("{}")
     with pytest.raises(DataError, match="must have mass, density and scale"):
         read_object_folder(assets / "box", 1.0)
     with pytest.raises(DataError, match="scale must be a positive number, got 0"):
