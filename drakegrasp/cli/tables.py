@@ -13,7 +13,7 @@ from rich.table import Table
 from drakegrasp.cli.console import say
 from drakegrasp.dataset.assemble import validate_assembled
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.reach import ReachCount, count_reach
+from drakegrasp.dataset.reach import count_reach
 from drakegrasp.dataset.statistics import (
     Funnel,
     SplitCount,
@@ -129,14 +129,6 @@ def approach_line(funnel: Funnel) -> str:
     return f"{found} in {cells}; above the table they come from {shares}"
 
 
-def reach_line(count: ReachCount) -> str:
-    """Return how many samples an arm reaches, in all and by elevation."""
-    bands = zip(BANDS, count.reachable.tolist(), count.asked.tolist(), strict=True)
-    parts = ", ".join(f"{low}-{high}° {part} of {whole}" for (low, high), part, whole in bands)
-    total = f"{count.reachable.sum():,} of {counted(int(count.asked.sum()), 'sample')}"
-    return f"{_safe(count.name)} reaches {total}; by elevation of the approach {parts}"
-
-
 def _count(number: int) -> str:
     return f"{int(number):,}"
 
@@ -161,4 +153,4 @@ def print_stats(out: Path) -> None:
     if line := approach_line(funnel):
         say(line)
     for count in count_reach(out):
-        say(reach_line(count))
+        say(escape(count.explain()))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from drakegrasp.dataset.hdf5 import AnyArray, open_reach, read_columns
 from drakegrasp.dataset.paths import reach_names, reach_path
 from drakegrasp.dataset.schema import REACH_FIELDS
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import counted, printable
 from drakegrasp.frames import unpack_pose
 from drakegrasp.grasp import BANDS, elevation_bands
 
@@ -40,6 +42,18 @@ class ReachCount:
     name: str
     asked: npt.NDArray[np.int64]
     reachable: npt.NDArray[np.int64]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counts as JSON types."""
+        asked, reachable = self.asked.tolist(), self.reachable.tolist()
+        return {"name": self.name, "asked": asked, "reachable": reachable}
+
+    def explain(self) -> str:
+        """Return how many samples the arm reaches, in all and by elevation."""
+        bands = zip(BANDS, self.reachable.tolist(), self.asked.tolist(), strict=True)
+        parts = ", ".join(f"{low}-{high}° {part} of {whole}" for (low, high), part, whole in bands)
+        total = f"{self.reachable.sum():,} of {counted(int(self.asked.sum()), 'sample')}"
+        return printable(f"{self.name} reaches {total}; by elevation of the approach {parts}")
 
 
 def count_reach(out: Path) -> list[ReachCount]:

@@ -225,8 +225,5 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     }
     # Most datasets have no files of arms.
     if counts := count_reach(out):
-        found["reach"] = [
-            {"name": c.name, "asked": c.asked.tolist(), "reachable": c.reachable.tolist()}
-            for c in counts
-        ]
+        found["reach"] = [count.as_dict() for count in counts]
     return found

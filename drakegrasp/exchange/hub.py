@@ -24,6 +24,7 @@ from PIL import Image
 
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.reach import count_reach
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
     CAMERAS,
@@ -61,7 +62,7 @@ seen. A grasp is contact points [m] and normals of the fingers {fingers} in the 
 | split | samples | distinct | objects | classes |
 |---|--:|--:|--:|--:|
 {splits}
-
+{reach}
 Made by {versions} with the hand `{hand}`, configuration `{config}`; split by {by}. Everything is
 simulated: no grasp was tried on a real robot. Licences of the meshes:
 
@@ -184,6 +185,7 @@ def _card(out: Path, files: Mapping[str, list[dict[str, str]]], licence: str | N
         fingers=", ".join(manifest.fingers),
         conventions="\n".join(f"* **{name}**: {said}" for name, said in CONVENTIONS.items()),
         splits="\n".join(f"| {' | '.join(map(str, row))} |" for row in splits),
+        reach="".join(f"\n* arm {count.explain()}" for count in count_reach(out)) + "\n",
         versions=", ".join(f"{name} {version}" for name, version in manifest.versions.items()),
         hand=Path(manifest.config.hand).stem,
         config=manifest.config.simulation_hash(),

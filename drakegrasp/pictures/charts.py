@@ -97,6 +97,34 @@ def draw_distributions(
     return figure
 
 
+def draw_parts(
+    groups: Mapping[str, tuple[Array, Array]], names: Sequence[str], *, title: str, what: str
+) -> Figure:
+    """Return fractions as bars, with their counts, a colour per group.
+
+    Args:
+        groups: By name, counts of parts (k,) and of wholes (k,).
+        names: Names of the k wholes.
+        title: What the fractions are of.
+        what: What the names tell.
+    """
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    axes, width = figure.add_subplot(), 0.8 / len(groups)
+    axes.set_title(title, fontsize="medium", color=INK)
+    for i, (name, (parts, wholes)) in enumerate(groups.items()):
+        x = np.arange(len(names)) + (i - (len(groups) - 1) / 2.0) * width
+        shares, colour = parts / np.maximum(wholes, 1), _COLOURS[-1 - i % len(_COLOURS)]
+        bars = axes.bar(x, shares, width, color=colour, label=name.replace("$", r"\$"))
+        labels = [f"{part} of {whole}" for part, whole in zip(parts, wholes, strict=True)]
+        axes.bar_label(bars, labels, padding=3, color=INK, fontsize=8)
+    axes.set_xticks(range(len(names)), names)
+    axes.set_ylim(0.0, 1.1)
+    axes.set_xlabel(what)
+    axes.legend(frameon=False, labelcolor=INK, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _plain(axes)
+    return figure
+
+
 def draw_reach(p_TS: Array, share: Array, base: Sequence[float], *, title: str = "") -> Figure:
     """Return a map of the table: which fraction of grasps an arm reaches at each place.
 

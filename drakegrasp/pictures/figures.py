@@ -22,7 +22,8 @@ from matplotlib.figure import Figure
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, reach_names
+from drakegrasp.dataset.reach import ReachCount, count_reach
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.statistics import Funnel, count_funnel
@@ -30,8 +31,9 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, counted
 from drakegrasp.filters import Removal
 from drakegrasp.frames import Array
+from drakegrasp.grasp import BANDS
 from drakegrasp.outcomes import Outcome
-from drakegrasp.pictures.charts import draw_counts, draw_distributions
+from drakegrasp.pictures.charts import draw_counts, draw_distributions, draw_parts
 from drakegrasp.pictures.style import (
     INK,
     add_axes,
@@ -112,6 +114,8 @@ def write_figures(out: Path, folder: Path, *, progress: Report = silent) -> Writ
         "outcomes": lambda: _outcomes(funnel),
         "distributions": lambda: _distributions(samples, funnel),
     }
+    if reach_names(out):  # most datasets have no files of arms
+        drawings["reach"] = lambda: _reach(count_reach(out))
 
     # A figure is drawn if there are data.
     written, numbers = Written(folder=folder), {}
@@ -127,7 +131,7 @@ def write_figures(out: Path, folder: Path, *, progress: Report = silent) -> Writ
         progress(done, len(drawings))
 
     # Delete figures of an earlier run that this run did not draw.
-    for name in set(drawings).difference(written.names):
+    for name in {*drawings, "reach"}.difference(written.names):
         for suffix in (".png", ".svg"):
             (folder / f"{name}{suffix}").unlink(missing_ok=True)
     text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)
@@ -222,6 +226,16 @@ def _distributions(samples: Samples, funnel: Funnel) -> Drawn:
     }
     quantities = list(samples.quantities.items())
     return draw_distributions(quantities, samples.groups, title=_told(funnel)), numbers
+
+
+def _reach(counts: Sequence[ReachCount]) -> Drawn:
+    figure = draw_parts(
+        {count.name: (count.reachable, count.asked) for count in counts},
+        [f"{low}-{high}°" for low, high in BANDS],
+        title="fraction of the samples that an arm reaches",
+        what="elevation from which the palm approaches",
+    )
+    return figure, [count.as_dict() for count in counts]
 
 
 # The sheet of samples.

@@ -30,6 +30,7 @@ from drakegrasp.filters import Removal
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import MODELS, hand_names
 from drakegrasp.page.app import Inspection, make_app
+from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 from drakegrasp.reach import place, rows
 from drakegrasp.reach.arm import ARMS, TABLE_SIZE, Arm, load_arm, mount_of, mount_pose
 from drakegrasp.reach.reaching import Reach
@@ -168,6 +169,29 @@ def test_stats_count_by_elevation(asked: Path) -> None:
     ) in result.stdout
     (said,) = json.loads(run("stats", asked, "--json").stdout)["reach"]
     assert said == {"name": "six", "asked": [0, 0, 9], "reachable": [0, 0, reachable]}
+
+
+def test_card_and_figures_tell_the_share_of_each_arm(mixed: Path, tmp_path: Path) -> None:
+    expected = [
+        {"name": "mixed", "asked": [0, 0, 9], "reachable": [0, 0, 2]},
+        json.loads(run("stats", mixed, "--json").stdout)["reach"][1],
+    ]
+    folder = tmp_path / "figures"
+    assert "reach" in write_figures(mixed, folder).names
+    assert (folder / "reach.png").is_file()
+    assert json.loads((folder / NUMBERS_FILE).read_text())["reach"] == expected
+    pytest.importorskip("datasets")
+    assert run("export", mixed, tmp_path / "hub", "--to", "hf", "--quiet").exit_code == 0
+    text = (tmp_path / "hub" / "README.md").read_text()
+    assert (
+        "* arm mixed reaches 2 of 9 samples; by elevation of the approach 0-30° 0 of 0, "
+        "30-60° 0 of 0, 60-90° 2 of 9\n* arm six reaches "
+    ) in text
+
+    # Without files of arms there is none of it, and an old picture is removed.
+    shutil.rmtree(mixed / "reach")
+    assert "reach" not in write_figures(mixed, folder).names
+    assert not (folder / "reach.png").exists()
 
 
 def test_the_filter_of_reachable_grasps(
