@@ -12,6 +12,7 @@ from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import ConfigError
 from drakegrasp.hand.settings import override_config
+from drakegrasp.reach.arm import Arm
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring import predicting
@@ -28,6 +29,7 @@ def predict_scenes(
     simulate: int = 0,
     count: int | None = None,
     overrides: Sequence[str] = (),
+    arm: Arm | None = None,
     client: Client | None = None,
     workers: int | None = None,
     show: bool = False,
@@ -43,6 +45,8 @@ def predict_scenes(
             this view, see `rank`; the lifts have the rules of the dataset.
         count: Maximum number of grasps of a view; None for all.
         overrides: Strings `"a.b=c"`, which change the configuration of the dataset.
+        arm: An arm, see `load_arm`, on the table of the scenes: grasps of a view that it does not
+            reach come last, with a confidence of 0; `q_arm` has its joints at the others.
         client: A Dask client whose workers share the views, e.g. from `connect`.
         workers: Number of processes of this machine, instead of a client; None for one per core.
         show: Whether to show progress on standard error.
@@ -78,6 +82,7 @@ def predict_scenes(
             simulate=simulate,
             count=count,
             overrides=overrides,
+            arm=arm,
             execute=execute,
             report=report,
         )

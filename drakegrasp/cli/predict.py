@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 HDF5 = (".h5", ".hdf5")
 #: Kinds of INPUT, and the options that each has.
 KINDS = {
-    "scenes": ("split", "workers"),
+    "scenes": ("split", "workers", "arm"),
     "a cloud": ("units", "arm"),
     "a depth image": ("camera", "mask", "camera_pose", "depth_scale", "arm"),
 }
@@ -107,18 +107,17 @@ def predict(
     options = {"split": split, "units": units, "workers": workers, "arm": robot.arm}
     _validate_options(kind, options | vars(image))
     how: dict[str, Any] = {"overrides": overrides, "count": count, "show": not quiet}
-    arm = robot.asked()
+    arm = how["arm"] = robot.asked()
     if kind == "scenes":
         how |= {"split": split or "test", "simulate": simulate or 0, "workers": workers}
         found, hand = _of_scenes(source, **how)
     else:
         tries = SIMULATED if simulate is None else simulate
-        how["arm"] = arm
         if kind == "a cloud":
             found, hand = _of_object(_read_cloud(source, units or "m"), None, tries, **how)
         else:
             found, hand = _of_object(*_see(source, image, show=not quiet), tries, **how)
-    write_attempts(out, found, hand)
+    write_attempts(out, found, hand, arm_joints=() if arm is None else arm.joints)
     say(str(out))
 
 
@@ -182,6 +181,8 @@ def _of_scenes(
     path: Path, *, overrides: tuple[str, ...], show: bool, **how: Any
 ) -> tuple[GraspTable, Hand]:
     """Return the grasps for the views of a split and their hand; print how many there are."""
+    import numpy as np
+
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.hand.settings import override_config
 
@@ -191,6 +192,9 @@ def _of_scenes(
     if show:
         views = len(set(found.of_row.tolist()))
         say(f"{len(found):,} grasps of {views:,} views", err=True)
+        if found.q_arm is not None:
+            served = len(set(found.of_row[np.isfinite(found.q_arm[:, 0])].tolist()))
+            say(f"the arm reaches a grasp of {served:,} of {views:,} views", err=True)
     if blind:
         say(f"{blind:,} views show too little of their object: no grasp", err=True)
     return found, dg.load_hand(config.hand_source)
@@ -225,8 +229,8 @@ def _of_object(
         found = replace(found, X_FG=X_CG, frame="camera", X_TC=X_TC)
     if show:
         say(ranking.explain(), err=True)
-        if arm is not None and (first := ranking.reach[ranking.order[0]]) and first.reachable:
-            joints = zip(arm.joints, first.q[1].tolist(), strict=True)
+        if arm is not None and found.q_arm is not None and np.isfinite(found.q_arm[0]).all():
+            joints = zip(arm.joints, found.q_arm[0].tolist(), strict=True)
             say("joints at the first grasp: " + ", ".join(f"{n} {q:.4f}" for n, q in joints))
     return found, dg.load_hand(config.hand_source)
 

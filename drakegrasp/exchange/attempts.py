@@ -11,6 +11,7 @@ docs/how-to/postures.md lists all layouts.
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -73,7 +74,7 @@ _KNOWN = (
     *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze"),
     *_SCALARS,
     *CONDITIONS,
-    *("X_TC", "X_TO", "row", "confidence"),
+    *("X_TC", "X_TO", "row", "confidence", "q_arm"),
 )
 
 
@@ -212,16 +213,19 @@ def read_arrays(path: Path, hand: Hand) -> dict[str, Any]:
     return _of_arrays(columns.read_arrays(path))
 
 
-def write_attempts(path: Path, table: GraspTable, hand: Hand) -> None:
+def write_attempts(
+    path: Path, table: GraspTable, hand: Hand, *, arm_joints: Sequence[str] = ()
+) -> None:
     """Write postures as an HDF5 file of arrays in our own layout, which `read_attempts` reads.
 
-    Attributes of the file state the hand and the version of drakegrasp. `link` is not written,
-    since the poses are those of the palm frame.
+    Attributes of the file state the hand and the version of drakegrasp, and the joints of an arm.
+    `link` is not written, since the poses are those of the palm frame.
 
     Args:
         path: The file; an older one is replaced.
         table: Postures with joints, in a frame whose poses do not need the mesh file.
         hand: The hand.
+        arm_joints: (a,), names of the joints of `q_arm`.
 
     Raises:
         GraspError: If a row is not a valid posture.
@@ -250,12 +254,15 @@ def write_attempts(path: Path, table: GraspTable, hand: Hand) -> None:
         "resting": None if (table.resting == UNTOLD).all() else table.resting,
         "row": table.of_row,
         "confidence": table.confidence,
+        "q_arm": table.q_arm,
     }
 
     # Columns without values are left out.
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file["frame"] = table.frame
         file.attrs.update({"hand": hand.name, "drakegrasp": __version__})
+        if arm_joints:
+            file.attrs["arm_joints"] = json.dumps(arm_joints)
         for name, words in texts.items():
             if words is not None:
                 file[name] = np.array(words, dtype=h5py.string_dtype())

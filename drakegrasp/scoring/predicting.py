@@ -117,7 +117,7 @@ def predict(
 
     Returns:
         Postures in the frame "table", whose `confidence` is the chance of a sample, or 0 for what
-        the arm does not reach; and the ranking of all proposals.
+        the arm does not reach, with the joints of the arm; and the ranking of all proposals.
 
     Raises:
         GraspError, HandError, MeshError: See `propose` and `rank`.
@@ -126,9 +126,15 @@ def predict(
     proposals = propose(cloud, hand, name=name)
     ranking = rank(proposals, cloud, hand, simulate=simulate, view=view, config=config, arm=arm)
     order = ranking.order[:count]
-    chance = ranking.chance if arm is None else np.where(ranking.reachable, ranking.chance, 0.0)
-    chosen = proposals.at(order.tolist())
-    return replace(chosen, confidence=chance[order], row=np.arange(len(order))), ranking
+    chosen = replace(proposals.at(order.tolist()), row=np.arange(len(order)))
+    if arm is None:
+        return replace(chosen, confidence=ranking.chance[order]), ranking
+    none, found = np.full(len(arm.joints), np.nan), [ranking.reach[i] for i in order]
+    return replace(
+        chosen,
+        confidence=np.where(ranking.reachable, ranking.chance, 0.0)[order],
+        q_arm=np.array([none if reach is None else reach.q[1] for reach in found]),
+    ), ranking
 
 
 def predict_scenes(
@@ -138,6 +144,7 @@ def predict_scenes(
     simulate: int = 0,
     count: int | None = None,
     overrides: Sequence[str] = (),
+    arm: Arm | None = None,
     execute: Executor = run_here,
     report: Report = silent,
 ) -> tuple[GraspTable, int]:
@@ -151,6 +158,7 @@ def predict_scenes(
         simulate: See `rank`; the lifts have the rules of the dataset.
         count: Maximum number of grasps of a view; None for all.
         overrides: Strings `"a.b=c"`, which change the configuration of the dataset.
+        arm: See `rank`; its base is on the table of the scenes.
         execute: Executor of the views.
         report: Called after each view.
 
@@ -167,7 +175,7 @@ def predict_scenes(
     if not len(data):
         raise GraspError(f"{path}: {data.emptiness}")
     config = override_config(read_manifest(data.path.parent).config, overrides)
-    work = partial(_predict_view, config, simulate, count)
+    work = partial(_predict_view, config, simulate, count, arm)
     tables = list[GraspTable]()
     for row, table in enumerate(in_order(execute)(work, _views(data))):
         if table is not None:
@@ -205,7 +213,7 @@ def _views(data: SceneDataset) -> Iterator[_SceneView]:
 
 
 def _predict_view(
-    config: Config, simulate: int, count: int | None, seen: _SceneView
+    config: Config, simulate: int, count: int | None, arm: Arm | None, seen: _SceneView
 ) -> GraspTable | None:
     """Return grasps for a view in {O}; None if it shows too little of its object.
 
@@ -215,7 +223,8 @@ def _predict_view(
     view = seen.view
     try:
         cloud = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
-        found, _ = predict(cloud, view, config, simulate=simulate, count=count, name=seen.name)
+        how = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
+        found, _ = predict(cloud, view, config, **how)
     except TooLittleSeenError:
         return None
     except GraspError as error:

@@ -142,6 +142,8 @@ class GraspTable(GraspRows):
         preshape: (n,), name of the hand's preshape; empty if all fingers close; or `EACH`.
         conditions: (n, 3), the `CONDITIONS` under which the grasp held; NaN if unknown.
             Verification uses them; a build draws its own conditions.
+        q_arm: (n, a), for predictions with an arm: its joints at the grasp; a row of NaN is out of
+            its reach.
     """
 
     objects: tuple[str, ...]
@@ -157,6 +159,7 @@ class GraspTable(GraspRows):
     said: tuple[str, ...]
     preshape: tuple[str, ...]
     conditions: Array
+    q_arm: Array | None = None
 
     def of_object(self, name: str) -> GraspTable:
         """Return the valid rows of an object, in their order."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 import h5py
 import numpy as np
 import pytest
+from helpers.arms import write_arm
 from helpers.commands import error_line, run
 from helpers.datasets import make_dataset
 from PIL import Image
@@ -23,6 +24,9 @@ from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
+from drakegrasp.reach.arm import mount_of
+from drakegrasp.reach.branches import flange_poses
+from drakegrasp.reach.cell import make_cell
 from drakegrasp.scoring.predicting import predict
 from drakegrasp.simulation.attempts import GraspTable
 from drakegrasp.vision.depth_image import cloud_from_depth
@@ -97,6 +101,39 @@ def test_grasps_of_scenes_are_those_of_their_views(
     X_TG = data[0]["X_AO"].astype(float) @ table.X_FG[:2]
     np.testing.assert_allclose(X_TG, own.X_FG[:2], atol=1e-5)
     np.testing.assert_allclose(table.confidence[:2], own.confidence[:2], atol=1e-3)
+
+
+def test_an_arm_is_asked_for_the_grasps_of_scenes(
+    scenes: Path, predicted: Path, tmp_path: Path
+) -> None:
+    """Of each view, what the arm reaches comes first, with its joints, in the scene's table."""
+    path, arm = tmp_path / "arm.h5", write_arm(tmp_path)
+    given = ("--arm", arm, "--base", "-0.42,0,0,0", "--workers", 1)
+    result = run("predict", scenes, "--out", path, *FEW[:2], "--count", 40, *given)
+    assert result.exit_code == 0, result.output
+    rows = SceneRows(scenes, split="train")
+    table = read_attempts(path, load_hand(), of=rows)
+    with h5py.File(path) as file:
+        q, names = file["q_arm"][:], json.loads(file.attrs["arm_joints"])
+    assert names == ["pan", "lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
+    assert q.shape == (len(table), 6)
+    reached = np.isfinite(q).all(axis=1)
+    assert 0 < reached.sum() < len(reached)
+    np.testing.assert_array_equal(table.confidence == 0.0, ~reached)
+    views = table.of_row
+    assert (np.diff(reached.astype(int))[np.diff(views) == 0] <= 0).all()
+    count, served = len(set(views.tolist())), len(set(views[reached].tolist()))
+    assert f"the arm reaches a grasp of {served} of {count} views" in result.output
+
+    # The joints bring the palm to the object, where the scene has it.
+    cell_arm = dg.load_arm(arm, (-0.42, 0.0, 0.0, 0.0))
+    cell = make_cell(cell_arm, "barrett", mount_of(cell_arm, load_hand()))
+    data = SceneDataset(scenes, points=None, negatives="none", balance="view")
+    X_TO = np.array([data[row]["X_AO"] for row in range(len(rows))], dtype=float)
+    X_TG = X_TO[views] @ table.X_FG
+    found = flange_poses(cell.chain, q[reached])[0] @ cell.X_FG
+    np.testing.assert_allclose(found, X_TG[reached], atol=1e-3)
+    assert np.abs(X_TO[:, :2, 3]).max() > 0.01  # not in the middle of the table
 
 
 @pytest.mark.slow
