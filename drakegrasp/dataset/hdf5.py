@@ -230,7 +230,7 @@ OF_SCENES: Kinds = {key: kind for key, kind in ORIGIN.items() if key != "K"}
 #: Attributes of files of arms, which have no images.
 OF_REACH: Kinds = {
     **{key: kind for key, kind in OF_SCENES.items() if key not in ("near", "far", "signature")},
-    **dict.fromkeys(("arm", "arm_sha256", "flange"), "a text"),
+    **dict.fromkeys(("arm", "arm_sha256", "arm_urdf", "flange"), "a text"),
     "arm_joints": "a list in JSON",
     "base": "X, Y, Z and yaw",
     "mount": "a pose of 12 numbers",

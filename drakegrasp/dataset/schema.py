@@ -102,7 +102,7 @@ class Field:
 
     Attributes:
         name: Path below the group, which is a split, `/trials`, `/objects`, `/successes`, `/looks`,
-            `/grasps`, `/scenes`, `/views`, `/visible` or `/rows`.
+            `/grasps`, `/scenes`, `/views`, `/visible`, `/reach`, `/shapes` or `/rows`.
         dtype: NumPy's name of the type, or "str" for UTF-8 text.
         meaning: One sentence that describes the field.
         shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer or a
@@ -783,6 +783,13 @@ REACH_FIELDS: tuple[Field, ...] = (
           unit="m", some=True, shown=Shown("clearance of the arm", "mm")),
 )
 
+#: A row per corner of the shapes of the arm, in `/shapes` of reach/NAME.hdf5.
+SHAPE_FIELDS: tuple[Field, ...] = (
+    Field("link", "str", "name of the link"),
+    Field("hull", "uint16", "number of the convex hull to which the corner belongs"),
+    Field("p_LC", "float64", "the corner, in the frame of its link", "3", "m"),
+)
+
 #: A row per predicted grasp, in `/rows` of the results for rows of a dataset.
 PREDICTED_ROW_FIELDS: tuple[Field, ...] = (
     Field("row", "int64", "row of the dataset's split to which the grasp belongs"),
@@ -805,7 +812,7 @@ SCENE_TABLES: Tables = {
     "grasps": SCENE_GRASP_FIELDS,
     "visible": VISIBLE_FIELDS,
 }
-REACH_TABLES: Tables = {"reach": REACH_FIELDS}
+REACH_TABLES: Tables = {"reach": REACH_FIELDS, "shapes": SHAPE_FIELDS}
 #: Columns that number the rows of another group, by their group.
 ROW_NUMBERS: Mapping[str, Mapping[str, str]] = {
     "trials": {"object": "objects"},

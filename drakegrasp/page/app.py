@@ -45,7 +45,7 @@ from drakegrasp.foreign_files import parse_json
 from drakegrasp.page.attempts import AttemptGallery
 from drakegrasp.page.gallery import Gallery, render
 from drakegrasp.page.predictions import Predictions, result_file
-from drakegrasp.page.renders import HandView, object_surface, read_render
+from drakegrasp.page.renders import HandView, arm_surface, object_surface, read_render
 from drakegrasp.page.scenes import Scenes
 from drakegrasp.page.snapshot import read_snapshot
 from drakegrasp.pictures.style import colour_png, strip_png
@@ -260,6 +260,13 @@ def _mesh(inspection: Inspection, name: str, params: Params) -> Response:
     return Response(_there(content, "mesh"), media_type="application/json")
 
 
+def _arm(inspection: Inspection, name: str, params: Params) -> Response:
+    number, _, arm = name.partition("-")
+    i = _there(inspection.table(AttemptGallery).find(number), "grasp")
+    content = arm_surface(inspection.snapshot, i, arm)
+    return Response(_there(content, "arm at this grasp"), media_type="application/json")
+
+
 def _there(found: Any, noun: str) -> Any:
     """Return `found` unless it is None.
 
@@ -282,6 +289,7 @@ PAGES: dict[str, Answer] = {
     "/view/{name}.png": _view,
     "/strip/{name}.png": _strip,
     "/mesh/{name}.json": _mesh,
+    "/arm/{name}.json": _arm,
 }
 
 

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
+from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
@@ -177,6 +178,7 @@ class AttemptGallery(Gallery):
             views.append({"camera": camera, "strip": strip, "unread": unread, "dots": dots})
 
         again = ("--trial", str(i), "--html", "trial.html")
+        arms = [name for name, reachable in _arms(snapshot.out, snapshot.key(i)) if reachable]
         return {
             "replay": shlex.join(["drakegrasp", "replay", str(snapshot.out), *again]),
             **self._decisions(),
@@ -188,7 +190,8 @@ class AttemptGallery(Gallery):
             "score": _text(snapshot, "anomaly", i),
             "parts": [(part.shown.title, _text(snapshot, part.name, i)) for part in PARTS],
             "facts": _facts(snapshot, i, row),
-            "scene": attempt_scene(snapshot, i, row, hand),
+            "scene": attempt_scene(snapshot, i, row, hand)
+            | {"arms": {f"arm {name}": f"/arm/{i}-{quote(name)}.json" for name in arms}},
         }
 
 
@@ -242,15 +245,18 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
             if field.shown is not None and field.name not in in_parts
         ),
         ("other links after closing", str(int(row["closed_other_links"])) if closed else "–"),
-        *_reach_facts(snapshot.out, key),
+        *(
+            (f"arm {name}", "reaches it" if reachable else "does not reach it")
+            for name, reachable in _arms(snapshot.out, key)
+        ),
     ]
 
 
-def _reach_facts(out: Path, key: AttemptKey) -> Iterator[tuple[str, str]]:
-    """Yield for each arm that was asked for an attempt whether it reaches it."""
+def _arms(out: Path, key: AttemptKey) -> Iterator[tuple[str, bool]]:
+    """Yield each arm that was asked for an attempt, and whether it reaches it."""
     values = (key.object, key.candidate, key.standoff_index)
     columns = {name: np.array([v]) for name, v in zip(IDENTITY, values, strict=True)}
     for name in reach_names(out):
         (asked,), (reachable,) = is_reachable(out, name, columns)
         if asked:
-            yield f"arm {name}", "reaches it" if reachable else "does not reach it"
+            yield name, bool(reachable)

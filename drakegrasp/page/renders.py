@@ -19,7 +19,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, reach_names, reach_path
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DrakegraspError
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
+#: Held while an arm is drawn, because Drake keeps one state of it.
+_ARMS = threading.Lock()
 _CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
 
 
@@ -268,6 +270,7 @@ def make_scene(
         "hasObject": find_model(snapshot.out, snapshot.names[number]) is not None,
         "links": len(hand.surfaces),
         "states": states,
+        "arms": {},
     }
 
 
@@ -322,3 +325,26 @@ def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
 
     path = find_model(snapshot.out, snapshot.names[number])
     return None if path is None else object_json(load_object(path))
+
+
+def arm_surface(snapshot: Snapshot, i: int, name: str) -> bytes | None:
+    """Return an arm at the grasp of an attempt and before its approach as JSON.
+
+    It is None if there is no such arm, or it does not reach the grasp.
+
+    Args:
+        snapshot: State of the files.
+        i: Place of the attempt in the table.
+        name: Name of the arm's file.
+
+    Raises:
+        DataError: If the file is damaged.
+    """
+    from drakegrasp.pictures.still_scene import arm_json
+    from drakegrasp.reach.rows import draw_row
+
+    if name not in reach_names(snapshot.out):
+        return None
+    with _ARMS:
+        drawn = draw_row(reach_path(snapshot.out, name), snapshot.config, snapshot.key(i))
+    return arm_json(drawn) if drawn else None

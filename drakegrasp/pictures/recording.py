@@ -24,7 +24,7 @@ from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.pictures.style import PREDICTED
+from drakegrasp.pictures.style import PREDICTED, SEEN_THROUGH, STILL
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.simulation.attempt import Attempt
@@ -46,8 +46,6 @@ CAPTION = (
 )
 #: Length and radius of an arrow's head [m].
 HEAD, HEAD_RADIUS = 0.009, 0.0035
-#: Colour of what does not move, and how opaque it is if it can be seen through.
-STILL, SEEN_THROUGH = (0.6, 0.66, 0.74), 0.25
 #: Direction of the camera: azimuth about the vertical from the palm's side, and elevation [rad].
 AZIMUTH, ELEVATION = np.deg2rad(50.0), np.deg2rad(20.0)
 #: Distance of the camera in radii of a sphere around the whole lift; the hand's addition to this

@@ -5,7 +5,8 @@ and pictures. Nothing is simulated.
 
 For the 3D view of a browser, links and objects are JSON: a list of parts, each with its `colour`
 "#rrggbb", `vertices` (n, 3) as float32 [m] and `faces` (m, 3) as uint32, both little-endian in
-base64. A link is in its own frame, an object in {O}.
+base64. A link is in its own frame, an object in {O}, an arm in {T}; a part of an arm states its
+`opacity`.
 
 OpenGL starts with the first picture. As in `vision.rendering`, all pictures of a process must be
 rendered in one thread.
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,15 @@ from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_corners, pad_surfaces
 from drakegrasp.mesh.loading import load_surface
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.pictures.style import FINGER_COLOURS, INK, add_axes, hide_ticks, save_figure
+from drakegrasp.pictures.style import (
+    FINGER_COLOURS,
+    INK,
+    SEEN_THROUGH,
+    STILL,
+    add_axes,
+    hide_ticks,
+    save_figure,
+)
 from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import object_colour
 from drakegrasp.vision.rendering import BLANK, GREY, drawn_mesh
@@ -263,6 +272,16 @@ def object_json(model: ObjectModel) -> bytes:
     """Return the visual mesh of an object, as JSON."""
     colour = object_colour(model.name)
     return json.dumps([_part(model.visual_vertices, model.visual_faces, colour)]).encode()
+
+
+def arm_json(drawn: Mapping[str, Array]) -> bytes:
+    """Return triangles (t, 3, 3) [m] as JSON; the first are solid, the others are seen through."""
+    parts = []
+    for triangles in drawn.values():
+        faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+        part: dict[str, Any] = dict(_part(triangles.reshape(-1, 3), faces, STILL))
+        parts.append(part | {"opacity": SEEN_THROUGH if parts else 1.0})
+    return json.dumps(parts).encode()
 
 
 def link_surfaces(scene: StillScene) -> dict[str, bytes]:

@@ -33,6 +33,8 @@ from drakegrasp.vision.camera import project
 PREDICTED, REACHED, TRUE = "#0072B2", "#D55E00", "#009E73"
 #: Colours of the fingers in grasp order (Okabe and Ito: safe for the colour-blind).
 FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
+#: Colour of an arm, which does not move, and how opaque it is if it can be seen through.
+STILL, SEEN_THROUGH = (0.6, 0.66, 0.74), 0.25
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
 #: A contact that is farther than this behind the depth image counts as hidden [m]; fingertips are

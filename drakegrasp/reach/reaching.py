@@ -177,15 +177,18 @@ def reach_attempt(
     return reach_grasp(cell, field, grasp)
 
 
-def draw_arm(arm: Arm, reach: Reach, config: Config) -> dict[str, Array]:
+def draw_arm(arm: Arm, q: Array, config: Config) -> dict[str, Array]:
     """Return triangles (t, 3, 3) [m] of an arm at the grasp and before the approach, in {T}.
 
-    They are empty if the grasp is not reachable.
+    Args:
+        arm: The arm.
+        q: (3, a), joints, see `Reach`; nothing is returned for NaN.
+        config: The hand.
     """
-    if not reach.reachable:
+    if np.isnan(q).any():
         return {}
     cell = make_cell(arm, config.hand_source, mount_of(arm, load_hand(config.hand_source)))
-    return {"grasp": cell.arm_triangles(reach.q[1]), "approach": cell.arm_triangles(reach.q[0])}
+    return {"grasp": cell.arm_triangles(q[1]), "approach": cell.arm_triangles(q[0])}
 
 
 def approach_path(grasp: Grasp, step: float = STEP) -> Array:

@@ -24,7 +24,8 @@ from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manife
 from drakegrasp.dataset.paths import reach_path
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reach import IDENTITY, NO_ROW, OWN_IDENTITY, rows_by_identity
-from drakegrasp.dataset.schema import REACH_FIELDS, REACHES
+from drakegrasp.dataset.rejections import AttemptKey
+from drakegrasp.dataset.schema import REACH_FIELDS, REACHES, SHAPE_FIELDS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
@@ -36,7 +37,7 @@ from drakegrasp.hand.parsing import position_order
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.reach.arm import Arm, mount_of
 from drakegrasp.reach.cell import Cell, make_cell
-from drakegrasp.reach.reaching import Grasp, reach_grasp
+from drakegrasp.reach.reaching import Grasp, draw_arm, reach_grasp
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
@@ -45,6 +46,8 @@ from drakegrasp.table import Table
 
 #: Columns of trials from which the rows follow.
 _FOLLOW_FROM = (*OPEN_FOLLOWS_FROM, "X_TO", "X_OG", "closed_q")
+#: When an arm has the joints of `Reach.q`.
+WHEN = ("approach", "grasp", "lift")
 
 
 def reach_dataset(
@@ -104,7 +107,53 @@ def _reach(out: Path, arm: Arm, path: Path, execute: Executor, progress: Report)
             file.attrs.update(attributes)
             for field in REACH_FIELDS:
                 write_field(file.require_group("reach"), field, rows[field.name])
+            for field in SHAPE_FIELDS:
+                write_field(file.require_group("shapes"), field, _shapes(arm)[field.name])
     return rows
+
+
+def _shapes(arm: Arm) -> dict[str, AnyArray]:
+    """Return the columns of SHAPE_FIELDS of an arm."""
+    hulls = [np.frombuffer(corners).reshape(-1, 3) for _, corners in arm.hulls]
+    numbers = np.repeat(np.arange(len(hulls), dtype=np.uint16), [len(hull) for hull in hulls])
+    links = np.array([link for link, _ in arm.hulls], dtype=object)
+    return {
+        "link": links[numbers],
+        "hull": numbers,
+        "p_LC": np.concatenate([np.zeros((0, 3)), *hulls]),
+    }
+
+
+def draw_row(path: Path, config: Config, key: AttemptKey) -> dict[str, Array]:
+    """Return triangles (t, 3, 3) [m] of an arm at a grasp, see `draw_arm`.
+
+    Args:
+        path: File of the arm.
+        config: Configuration of the dataset.
+        key: The grasp.
+
+    Raises:
+        DataError: If the file is missing or damaged.
+    """
+    with open_reach(path) as file:
+        about, rows = dict(file.attrs), read_columns(file["reach"], REACH_FIELDS)
+        shapes = read_columns(file["shapes"], SHAPE_FIELDS)
+    wanted = [np.array([value]) for value in (key.object, key.candidate, key.standoff_index)]
+    (place,) = rows_by_identity([rows[name] for name in OWN_IDENTITY], wanted)
+    if place == NO_ROW:
+        return {}
+    hulls = [shapes[shapes.hull == number] for number in np.unique(shapes.hull)]
+    arm = Arm(
+        name=about["arm"],
+        urdf=about["arm_urdf"],
+        hulls=tuple((hull.link[0], hull.p_LC.tobytes()) for hull in hulls),
+        digest=about["arm_sha256"],
+        flange=about["flange"],
+        joints=tuple(json.loads(about["arm_joints"])),
+        base=tuple(about["base"].tolist()),
+        mount=tuple(unpack_pose(about["mount"]).ravel().tolist()),
+    )
+    return draw_arm(arm, np.array([rows[f"q_{when}"][place] for when in WHEN]), config)
 
 
 def _attributes(manifest: Manifest, trials: Trials, arm: Arm, X_FB: Array) -> dict[str, Any]:
@@ -114,6 +163,7 @@ def _attributes(manifest: Manifest, trials: Trials, arm: Arm, X_FB: Array) -> di
         "shards": trials.attributes["shards"],
         "arm": arm.name,
         "arm_sha256": arm.digest,
+        "arm_urdf": arm.urdf,
         "flange": arm.flange,
         "arm_joints": json.dumps(arm.joints),
         "base": np.array(arm.base),
@@ -256,6 +306,6 @@ def reach_object(task: ReachTask) -> dict[str, AnyArray]:
         "trial_id": np.asarray(task.trial_ids),
         "reachable": outcome == 0,
         "reach_outcome": outcome,
-        **{name: q[:, k] for k, name in enumerate(("q_approach", "q_grasp", "q_lift"))},
+        **{f"q_{when}": q[:, k] for k, when in enumerate(WHEN)},
         "clearance": clearance,
     }

@@ -321,7 +321,7 @@ class Verification:
             return {}
         moved = multiply(self.placed.X_TO_simulated, invert_pose(self.placed.X_TO))
         X_WT_moved = multiply(X_WT, moved)
-        drawn = draw_arm(self.arm, self.reach, self.config)
+        drawn = draw_arm(self.arm, self.reach.q, self.config)
         return {
             name: transform_points(X_WT_moved, triangles.reshape(-1, 3)).reshape(-1, 3, 3)
             for name, triangles in drawn.items()

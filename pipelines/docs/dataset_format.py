@@ -163,9 +163,10 @@ _REACH = """
 `drakegrasp reach` writes such a file for an arm, see [the guide](../how-to/reach.md). A row belongs
 to the attempt of `object`, `candidate` and `standoff_index`, also after the dataset grew. The file
 has the attributes of `trials.hdf5` except `signature`, `K`, `near` and `far`, and those of the arm:
-its name `arm`, a hash `arm_sha256` of its file and meshes, `flange`, the names `arm_joints` of its
-joints (JSON), `base` (X, Y, Z and yaw of its first link in {T} [m, rad]) and `mount` (X_FB, the
-hand's palm link on the flange). `a` is the number of its joints.
+its name `arm`, a hash `arm_sha256` of its file and meshes, its links and joints without meshes
+`arm_urdf`, `flange`, the names `arm_joints` of its joints (JSON), `base` (X, Y, Z and yaw of its
+first link in {T} [m, rad]) and `mount` (X_FB, the hand's palm link on the flange). `a` is the
+number of its joints.
 
 ### /reach
 """
@@ -214,6 +215,7 @@ _TABLES = (
     ("\n### /visible\n", schema.VISIBLE_FIELDS, False),
     ("\n### /objects of scenes.hdf5\n", schema.SCENE_OBJECT_FIELDS, False),
     (_REACH, schema.REACH_FIELDS, False),
+    ("\n### /shapes\n", schema.SHAPE_FIELDS, False),
     (_SHARDS, schema.LOOK_FIELDS, False),
     (_VERIFICATION, schema.VERIFICATION_FIELDS, True),
     (_ROWS, schema.PREDICTED_ROW_FIELDS, False),

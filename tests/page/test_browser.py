@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import uvicorn
+from helpers.arms import write_arm
 from helpers.pages import coded, numbered
 from helpers.predictions import write_predictions
 from matplotlib.image import imread
@@ -28,6 +29,8 @@ from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.generation.scenes import make_scenes
 from drakegrasp.page.app import Inspection, listen, make_app
 from drakegrasp.page.snapshot import Snapshot, read_snapshot
+from drakegrasp.reach.arm import load_arm
+from drakegrasp.reach.rows import reach_dataset
 
 playwright = pytest.importorskip("playwright.sync_api")
 Browser, Page = playwright.Browser, playwright.Page
@@ -201,6 +204,21 @@ def test_3d_view_draws_each_state(page: Page, address: str, state: Snapshot) -> 
     assert len(shots) == 3
     page.uncheck("[data-layer=hand]")
     assert page.locator("#view3d").screenshot() not in shots
+
+
+def test_3d_view_shows_an_arm_that_is_asked_for(
+    page: Page, address: str, out: Path, tmp_path: Path
+) -> None:
+    rows = reach_dataset(out, load_arm(write_arm(tmp_path), (-0.5, 0.0, 0.0, 0.0)))
+    trial = rows.trial_id[rows.reachable][0]
+    page.goto(f"{address}/grasp/{trial}")
+    wait_for_view(page)
+    view = page.locator("#view3d")
+    shots = [view.screenshot()]
+    for choose in (page.check, page.uncheck):  # the view moves back, and the arm goes
+        choose("[data-layer='arm six']")
+        wait_until(page, lambda: view.screenshot() not in shots)
+        shots.append(view.screenshot())
 
 
 def test_keys_move_the_3d_view(page: Page, address: str, state: Snapshot) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 from collections.abc import Callable
@@ -29,11 +30,12 @@ from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import MODELS, hand_names
+from drakegrasp.hand.settings import load_config
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 from drakegrasp.reach import place, rows
 from drakegrasp.reach.arm import ARMS, TABLE_SIZE, Arm, load_arm, mount_of, mount_pose
-from drakegrasp.reach.reaching import Reach
+from drakegrasp.reach.reaching import Reach, draw_arm
 from drakegrasp.reach.rows import reach_dataset
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.files import seal
@@ -227,6 +229,26 @@ def test_the_page_of_a_grasp_names_the_arms_that_were_asked(asked: Path) -> None
     assert "arm six" in text
     assert ("reaches it" if reachable else "does not reach it") in text
     assert "arm six" not in client.get(f"/grasp/{trial + 1}").text
+
+
+def test_the_page_draws_an_arm_at_grasp_and_approach(mixed: Path, six: Path, arm: Arm) -> None:
+    with h5py.File(reach_path(mixed, "mixed"), "r+") as file:
+        trials = file["reach/trial_id"][:2].tolist()
+        file["reach/q_approach"][0], file["reach/q_lift"][0] = 0.3, 0.5
+    seal(reach_path(mixed, "mixed"))
+    six.unlink()  # the file of the dataset has all that is drawn
+    client = TestClient(make_app(Inspection(mixed)), base_url="http://127.0.0.1")
+    for trial, shown in zip(trials, (True, False), strict=True):
+        assert ('data-layer="arm mixed"' in client.get(f"/grasp/{trial}").text) == shown
+        answer = client.get(f"/arm/{trial}-mixed.json")
+        assert answer.status_code == (200 if shown else 404)
+        assert client.get(f"/arm/{trial}-other.json").status_code == 404
+    parts = client.get(f"/arm/{trials[0]}-mixed.json").json()
+    assert [part["opacity"] for part in parts] == [1.0, 0.25]
+    drawn = draw_arm(arm, np.repeat([[0.3], [0.1], [0.5]], 6, axis=1), load_config("fast"))
+    for part, when in zip(parts, ("grasp", "approach"), strict=True):
+        corners = np.frombuffer(base64.b64decode(part["vertices"]), "<f4").reshape(-1, 3, 3)
+        np.testing.assert_allclose(corners, drawn[when], atol=1e-6)
 
 
 def test_a_file_of_another_arm_is_not_replaced(out: Path, six: Path) -> None:

@@ -44,6 +44,8 @@
   const palms = new THREE.Group();
   const layers = { hand, object, contacts, forces, palms };
   for (const kind of Object.keys(kinds || {})) layers[kind] = new THREE.Group();
+  // Arms are loaded when they are first shown.
+  const arms = Object.keys(data.arms).map((name) => (layers[name] = new THREE.Group()));
   scene.add(...Object.values(layers));
   const place = (group, columns) => {
     group.matrixAutoUpdate = false;
@@ -154,6 +156,7 @@
       surface.setIndex(new THREE.BufferAttribute(numbers(part.faces, Uint32Array), 1));
       const look = { color: part.colour, metalness: 0, roughness: 0.75, flatShading: true };
       if (group.parent === hand) Object.assign(look, { transparent: true, opacity: 0.8 });
+      else if (part.opacity < 1) Object.assign(look, { transparent: true, opacity: part.opacity });
       group.add(new THREE.Mesh(surface, new THREE.MeshStandardMaterial(look)));
     }
   }
@@ -162,6 +165,7 @@
     const bounds = new THREE.Box3().setFromObject(object);
     if (bounds.isEmpty()) bounds.set(new THREE.Vector3(-0.05, -0.05, 0), new THREE.Vector3(0.05, 0.05, 0.1));
     const all = new THREE.Box3().setFromObject(hand).union(bounds).union(new THREE.Box3().setFromObject(palms));
+    for (const arm of arms) if (arm.visible) all.expandByObject(arm);
     const middle = bounds.getCenter(new THREE.Vector3()).lerp(all.getCenter(new THREE.Vector3()), 0.5);
     const radius = all.getSize(new THREE.Vector3()).length() / 2;
     // From beside the palm, so that the hand does not hide the object.
@@ -199,10 +203,15 @@
   });
   const boxes = [...document.querySelectorAll("[data-layer]")];
   for (const check of boxes) {
+    const name = check.dataset.layer, url = data.arms[name];
     check.addEventListener("change", () => {
-      layers[check.dataset.layer].visible = check.checked;
+      layers[name].visible = check.checked;
       draw();
     });
+    if (!url) continue;
+    check.addEventListener("change", () => {
+      load(url, layers[name]).then(aim).then(draw).catch((error) => { check.parentElement.append(`: ${error.message}`); });
+    }, { once: true });
   }
 
   // By keys: angles in radians about the vertical and above the table, a factor of the distance.
