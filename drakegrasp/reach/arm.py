@@ -254,6 +254,8 @@ def _plain_urdf(
         own = ElementTree.SubElement(root, "joint", name=joint.get("name", ""), type=kind)
         parts = ("origin", "parent", "child", *(("axis", "limit") if moves else ()))
         own.extend(part for key in parts for part in joint.findall(key))
+    for each in root.iter():
+        each.text = each.tail = None  # a file of a dataset has it on one line
     return ElementTree.tostring(root, encoding="unicode")
 
 

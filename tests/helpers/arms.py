@@ -46,7 +46,7 @@ def _link(name: str) -> str:
     shape = f"<geometry>{SHAPES[name]}</geometry>"
     origin = f'<origin xyz="{CENTRES.get(name, "0 0 0")}"/>'
     visual = '<visual><geometry><mesh filename="nowhere.dae"/></geometry></visual>'
-    return f'<link name="{name}">{visual}<collision>{origin}{shape}</collision></link>'
+    return f'<link name="{name}">{visual}\n<collision>{origin}{shape}</collision>\n</link>\n'
 
 
 def _joint(joint: tuple[str, str, str, str, str, str | None, tuple[float, float] | None]) -> str:

@@ -156,7 +156,8 @@
       surface.setIndex(new THREE.BufferAttribute(numbers(part.faces, Uint32Array), 1));
       const look = { color: part.colour, metalness: 0, roughness: 0.75, flatShading: true };
       if (group.parent === hand) Object.assign(look, { transparent: true, opacity: 0.8 });
-      else if (part.opacity < 1) Object.assign(look, { transparent: true, opacity: part.opacity });
+      // The triangles of an arm have no outer side.
+      if (part.opacity) Object.assign(look, { transparent: part.opacity < 1, opacity: part.opacity, side: THREE.DoubleSide });
       group.add(new THREE.Mesh(surface, new THREE.MeshStandardMaterial(look)));
     }
   }
