@@ -7,9 +7,10 @@ drawn literally: a dollar sign does not start a formula.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -26,6 +27,8 @@ GROUPS = {
     "stable": "#009E73",
 }
 FAILED = "#9AA0A8"
+#: Numbers of things, by kind.
+Counts: TypeAlias = npt.NDArray[np.int64]
 #: Bins of a histogram, and the fraction of the values that determines its range, since a few
 #: extreme values would squeeze the others.
 BINS, SHOWN = 40, 0.98
@@ -98,7 +101,7 @@ def draw_distributions(
 
 
 def draw_parts(
-    groups: Mapping[str, tuple[Array, Array]], names: Sequence[str], *, title: str, what: str
+    groups: Mapping[str, tuple[Counts, Counts]], names: Sequence[str], *, title: str, what: str
 ) -> Figure:
     """Return fractions as bars, with their counts, a colour per group.
 
@@ -115,10 +118,10 @@ def draw_parts(
         x = np.arange(len(names)) + (i - (len(groups) - 1) / 2.0) * width
         shares, colour = parts / np.maximum(wholes, 1), _COLOURS[-1 - i % len(_COLOURS)]
         bars = axes.bar(x, shares, width, color=colour, label=name.replace("$", r"\$"))
-        labels = [f"{part} of {whole}" for part, whole in zip(parts, wholes, strict=True)]
+        labels = [f"{part}\nof {whole}" for part, whole in zip(parts, wholes, strict=True)]
         axes.bar_label(bars, labels, padding=3, color=INK, fontsize=8)
     axes.set_xticks(range(len(names)), names)
-    axes.set_ylim(0.0, 1.1)
+    axes.set_ylim(0.0, 1.2)
     axes.set_xlabel(what)
     axes.legend(frameon=False, labelcolor=INK, loc="center left", bbox_to_anchor=(1.0, 0.5))
     _plain(axes)

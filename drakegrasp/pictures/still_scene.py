@@ -276,11 +276,11 @@ def object_json(model: ObjectModel) -> bytes:
 
 def arm_json(drawn: Mapping[str, Array]) -> bytes:
     """Return triangles (t, 3, 3) [m] as JSON; the first are solid, the others are seen through."""
-    parts = []
+    parts = list[dict[str, Any]]()
     for triangles in drawn.values():
         faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-        part: dict[str, Any] = dict(_part(triangles.reshape(-1, 3), faces, STILL))
-        parts.append(part | {"opacity": SEEN_THROUGH if parts else 1.0})
+        opacity = SEEN_THROUGH if parts else 1.0
+        parts.append({**_part(triangles.reshape(-1, 3), faces, STILL), "opacity": opacity})
     return json.dumps(parts).encode()
 
 

@@ -223,8 +223,9 @@ def _predict_view(
     view = seen.view
     try:
         cloud = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
-        how = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
-        found, _ = predict(cloud, view, config, **how)
+        found, _ = predict(
+            cloud, view, config, simulate=simulate, count=count, name=seen.name, arm=arm
+        )
     except TooLittleSeenError:
         return None
     except GraspError as error:
