@@ -237,6 +237,7 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
     if row["source"] == Source.CLOSING:
         standoff = "none, tried as it is"
     in_parts, closed = {part.name for part in PARTS}, np.isfinite(row["time_close"])
+
     return [
         ("palm pose, stand-off", f"{key.candidate}, {standoff}"),
         *(

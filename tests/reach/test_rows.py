@@ -30,12 +30,12 @@ from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import MODELS, hand_names
-from drakegrasp.hand.settings import load_config
 from drakegrasp.page.app import Inspection, make_app
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 from drakegrasp.reach import place, rows
 from drakegrasp.reach.arm import ARMS, TABLE_SIZE, Arm, load_arm, mount_of, mount_pose
-from drakegrasp.reach.reaching import Reach, draw_arm
+from drakegrasp.reach.cell import make_cell
+from drakegrasp.reach.reaching import Reach
 from drakegrasp.reach.rows import reach_dataset
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.files import seal
@@ -245,10 +245,10 @@ def test_the_page_draws_an_arm_at_grasp_and_approach(mixed: Path, six: Path, arm
         assert client.get(f"/arm/{trial}-other.json").status_code == 404
     parts = client.get(f"/arm/{trials[0]}-mixed.json").json()
     assert [part["opacity"] for part in parts] == [1.0, 0.25]
-    drawn = draw_arm(arm, np.repeat([[0.3], [0.1], [0.5]], 6, axis=1), load_config("fast"))
-    for part, when in zip(parts, ("grasp", "approach"), strict=True):
+    cell = make_cell(arm, "barrett", mount_of(arm, load_hand()))
+    for part, q in zip(parts, (0.1, 0.3), strict=True):  # the grasp, and the start of the approach
         corners = np.frombuffer(base64.b64decode(part["vertices"]), "<f4").reshape(-1, 3, 3)
-        np.testing.assert_allclose(corners, drawn[when], atol=1e-6)
+        np.testing.assert_allclose(corners, cell.arm_triangles(np.full(6, q)), atol=1e-6)
 
 
 def test_a_file_of_another_arm_is_not_replaced(out: Path, six: Path) -> None:
