@@ -231,12 +231,11 @@ def test_the_page_of_a_grasp_names_the_arms_that_were_asked(asked: Path) -> None
     assert "arm six" not in client.get(f"/grasp/{trial + 1}").text
 
 
-def test_the_page_draws_an_arm_at_grasp_and_approach(mixed: Path, six: Path, arm: Arm) -> None:
+def test_the_page_draws_an_arm_at_grasp_and_approach(mixed: Path, arm: Arm) -> None:
     with h5py.File(reach_path(mixed, "mixed"), "r+") as file:
         trials = file["reach/trial_id"][:2].tolist()
         file["reach/q_approach"][0], file["reach/q_lift"][0] = 0.3, 0.5
     seal(reach_path(mixed, "mixed"))
-    six.unlink()  # the file of the dataset has all that is drawn
     client = TestClient(make_app(Inspection(mixed)), base_url="http://127.0.0.1")
     for trial, shown in zip(trials, (True, False), strict=True):
         assert ('data-layer="arm mixed"' in client.get(f"/grasp/{trial}").text) == shown
