@@ -23,9 +23,11 @@ from helpers.objects import CUBE, box_model
 from hypothesis import HealthCheck, settings
 
 from drakegrasp.config import Config
+from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.runtime.executor import run_here
 
 # Software OpenGL must not start threads beside the test workers, and nothing needs the network.
@@ -120,6 +122,23 @@ def small_dataset(
         build(small_meshes, out, small_config)
 
     return made_once("small_dataset", make)
+
+
+@pytest.fixture(scope="session")
+def small_clutter(
+    small_dataset: Path, made_once: Callable[[str, Callable[[Path], object]], Path]
+) -> Path:
+    """The same dataset with three scenes of up to two objects, on the table and in a bin.
+
+    Both test scenes have kept grasps. Read only.
+    """
+
+    def make(out: Path) -> None:
+        around = [load_surroundings(name) for name in ("table", "bin")]
+        request = ClutterRequest(scenes=3, objects=(1, 2), surroundings=around, tries=4)
+        make_clutter(Path(shutil.copytree(small_dataset, out)), request)
+
+    return made_once("small_clutter", make)
 
 
 @pytest.fixture(scope="session")

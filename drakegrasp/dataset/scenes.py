@@ -32,7 +32,13 @@ from drakegrasp.dataset.hdf5 import (
     validate_codes,
 )
 from drakegrasp.dataset.reader import GraspDataset, emptiness_of
-from drakegrasp.dataset.schema import DEPTH_UNIT, SCENE_GRASP_FIELDS, SCENE_TABLES, SPLITS
+from drakegrasp.dataset.schema import (
+    DEPTH_UNIT,
+    NO_OBJECT,
+    SCENE_GRASP_FIELDS,
+    SCENE_TABLES,
+    SPLITS,
+)
 from drakegrasp.dataset.trials import Trials, reopened, stamp
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json, validate_local
@@ -89,6 +95,16 @@ class SceneDataset:
     | `mass`, `friction_hand`, `friction_table` | () float32 | of the object [kg], coefficients |
     | `view`, `scene`, `object` | () int64 | rows of /views, /scenes, /objects |
 
+    In clutter.hdf5 a scene has up to o objects: `X_AO` is (o, 4, 4), and `mass`, `friction_*` and
+    `object` are (o,), NaN and -1 beyond the last one. Grasps are of all objects, and further keys
+    tell of each of them:
+
+    | key | shape, type | what |
+    |---|---|---|
+    | `grasp_object` | (g,) uint8 | index of its object in the scene |
+    | `free` | (g,) bool | whether the hand meets nothing else on its way, by geometry |
+    | `clean` | (g,) bool | whether it is kept and leaves its neighbours where they are |
+
     With `points=None` an item has images instead of points: `rgb` (h, w, 3) uint8, `depth` (h, w)
     float32 [m], 0 for pixels without a depth, `mask` (h, w) uint8, 1 + index of the object, and the
     camera matrix `K` (3, 3) float32 [px]. Values that end in `_lifted` are NaN for hands that were
@@ -99,19 +115,20 @@ class SceneDataset:
     and index.
 
     Args:
-        path: OUT/scenes.hdf5.
+        path: OUT/scenes.hdf5 or OUT/clutter.hdf5.
         points: Number n of points of an item; None for images.
         frame: `table` or `camera`.
         negatives: Bad grasps to draw: `tested`, lifts that were tried and lost the object;
             `closed`, also hands that closed without all fingertips on the object; `none`.
         balance: `object`, so that each object is drawn equally often; `view`, so that each view is.
+            A view is one of each object that has a grasp to draw in its scene.
         split: `train`, `valid` or `test`.
         grasps: Number g of grasps of an item. If a scene has fewer, some are repeated.
         positives: Good grasps to draw: `kept`, or `lifted`, whatever the filters decided. A grasp
             that is lifted and not a sample is never drawn as a bad one.
         on_object: Fraction of the points that are on the object, if enough of it is in the image.
         noise: Whether depths get the noise that was drawn for their view, if any was.
-        objects: Names of the objects whose views are items; all if None.
+        objects: Names of the objects whose grasps are drawn and whose views are items; all if None.
         seed: Seed of all draws.
         cache: Memory for points or images of views, per process [byte]; other views are read again.
 
@@ -123,6 +140,7 @@ class SceneDataset:
         views: Rows of /views that can be items: those whose scene has a grasp to draw.
         image_size: Height and width of the images [px].
         near, far: Near and far planes of the cameras [m].
+        several: Whether the file has scenes of several objects.
         tables: Columns of /scenes, /views and /grasps by their names, for all splits; no images.
         epoch: Number of the epoch, on which all draws depend.
         emptiness: What is said of the split if it has no items.
@@ -184,11 +202,12 @@ class SceneDataset:
             self.joints = tuple(parse_json(file.attrs["joints"]))
             self.fingers = tuple(parse_json(file.attrs["fingers"]))
             self.near, self.far = float(file.attrs["near"]), float(file.attrs["far"])
+            self.several = "clutter" in file.attrs
         if objects is not None and (unknown := sorted(set(objects) - set(self.names))):
             raise DataError(f"objects must be of {self.path}, got {unknown[0]!r}")
         self._number()
-        self._choose(negatives, positives)
-        self.views, self._order = self._order_of(balance, objects)
+        self._choose(negatives, positives, objects)
+        self.views, self._order = self._order_of(balance)
 
     def __len__(self) -> int:
         return len(self._order)
@@ -213,17 +232,19 @@ class SceneDataset:
         else:
             item = self._cloud(view, X_AT, stream)
         item |= self._grasps_of(view, self._drawn(scene, stream), X_AT)
+        # A scene of one object has no axis of objects.
+        of = slice(None) if self.several else 0
         scenes = self.tables["scenes"]
         item |= {
-            key: np.asarray(scenes[key][scene, 0], dtype=np.float32)
+            key: np.asarray(scenes[key][scene, of], dtype=np.float32)
             for key in ("mass", "friction_hand", "friction_table")
         }
         return item | {
             "X_TC": X_TC.astype(np.float32),
-            "X_AO": (X_AT @ unpack_pose(scenes["X_TO"][scene, 0])).astype(np.float32),
+            "X_AO": (X_AT @ unpack_pose(scenes["X_TO"][scene, of])).astype(np.float32),
             "view": np.asarray(view, dtype=np.int64),
             "scene": np.asarray(scene, dtype=np.int64),
-            "object": np.asarray(scenes["object"][scene, 0], dtype=np.int64),
+            "object": np.asarray(scenes["object"][scene, of], dtype=np.int64),
         }
 
     def __iter__(self) -> Iterator[dict[str, AnyArray]]:
@@ -275,19 +296,23 @@ class SceneDataset:
         for name, shape in (("object", scenes["object"].shape), ("mask", self.image_size)):
             if count and 0 in shape:
                 raise DataError(f"{self.path}: {name} must have a value in each row, got none")
+        grasps = self.tables["grasps"]
         for name, values, codes in (
             ("/scenes/split", scenes["split"], len(SPLITS)),
             ("/scenes/object", scenes["object"][:, 0], len(self.names)),
             ("/views/scene", views["scene"], count),
-            ("/grasps/scene", self.tables["grasps"]["scene"], count),
+            ("/grasps/scene", grasps["scene"], count),
+            ("/grasps/object", grasps["object"], scenes["object"].shape[1]),
         ):
             validate_codes(self.path, name, values, codes)
+        self._object_of = scenes["object"][grasps["scene"], grasps["object"]]
+        validate_codes(self.path, "/grasps/object", self._object_of, len(self.names))
 
         # The grasps of a scene and the rows of a view are consecutive.
-        grasps = np.bincount(self.tables["grasps"]["scene"], minlength=count)
-        self._bounds = np.concatenate([[0], np.cumsum(grasps)])
+        in_scene = np.bincount(grasps["scene"], minlength=count)
+        self._bounds = np.concatenate([[0], np.cumsum(in_scene)])
         self._scene_of = views["scene"]
-        of_views = grasps[self._scene_of]
+        of_views = in_scene[self._scene_of]
         self._first_visible = np.concatenate([[0], np.cumsum(of_views)])
         if self._first_visible[-1] != len(self._visible):
             raise DataError(
@@ -296,8 +321,10 @@ class SceneDataset:
             )
         self._X_TC = unpack_pose(views["X_TC"])
 
-    def _choose(self, negatives: Negatives, positives: Positives) -> None:
-        """Find the good and bad grasps of each scene."""
+    def _choose(
+        self, negatives: Negatives, positives: Positives, names: Collection[str] | None
+    ) -> None:
+        """Find the good and bad grasps of each scene, on the named objects."""
         grasps = self.tables["grasps"]
         bad = grasps["tested"] & ~grasps["lifted"]
         if negatives == "closed":
@@ -305,19 +332,18 @@ class SceneDataset:
         if negatives == "none":
             bad[:] = False
         good = grasps[positives]
+        if names is not None:
+            named = np.isin(self.names, sorted(names))[self._object_of]
+            good, bad = good & named, bad & named
         self._kinds = []
         for first, last in zip(self._bounds[:-1], self._bounds[1:], strict=True):
             rows = np.arange(first, last)
             self._kinds.append((rows[good[rows]], rows[bad[rows]]))
 
-    def _order_of(
-        self, balance: Balance, names: Collection[str] | None
-    ) -> tuple[AnyArray, AnyArray]:
+    def _order_of(self, balance: Balance) -> tuple[AnyArray, AnyArray]:
         """Return the views to draw from, and for each item the index of its object or view."""
         scenes = self.tables["scenes"]
         usable = np.array([len(good) + len(bad) > 0 for good, bad in self._kinds], dtype=bool)
-        if names is not None:
-            usable &= np.isin(self.names, sorted(names))[scenes["object"][:, 0]]
         filled = np.unique(scenes["split"][usable])
         self.emptiness = emptiness_of(self.split, [SPLITS[i] for i in filled])
         usable &= scenes["split"] == SPLITS.index(self.split)
@@ -325,8 +351,11 @@ class SceneDataset:
         self._balance = balance
         if balance == "view" or not len(views):
             return views, np.arange(len(views))
-        objects = scenes["object"][self._scene_of[views], 0]
-        self._by_object = [views[objects == i] for i in np.unique(objects)]
+        graspable = [np.unique(self._object_of[np.concatenate(kinds)]) for kinds in self._kinds]
+        objects = [graspable[scene] for scene in self._scene_of[views]]
+        self._by_object = [
+            views[[i in there for there in objects]] for i in np.unique(np.concatenate(objects))
+        ]
         return views, np.arange(len(views)) % len(self._by_object)
 
     # Draws
@@ -360,6 +389,9 @@ class SceneDataset:
         R_TA = X_AT[:3, :3].T
         first = self._first_visible[view] - self._bounds[self._scene_of[view]]
         found = {key: grasps[key][rows] for key in _AS_STORED}
+        if self.several:
+            found |= {key: grasps[key][rows] for key in ("free", "clean")}
+            found["grasp_object"] = grasps["object"][rows]
         found["visible"] = self._visible[first + rows]
         for suffix in ("", "_lifted"):
             X_TG = unpack_pose(grasps[f"X_TG{suffix}"][rows])
@@ -468,7 +500,7 @@ def count_scenes(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str,
     return {
         name: {
             "scenes": int((split == i).sum()),
-            "objects": len(np.unique(objects[split == i])),
+            "objects": len(np.unique(objects[(split == i)[:, None] & (objects != NO_OBJECT)])),
             "views": int((of_views == i).sum()),
             "grasps": int((of_grasps == i).sum()),
             **{label: int(grasps[label][:][of_grasps == i].sum()) for label in LABELS},

@@ -35,6 +35,7 @@ OUT/
   grasping_otm.hdf5        the same samples; up in the image is up in the world
   reach/NAME.hdf5          which samples an arm reaches; on request
   scenes.hdf5              views that do not depend on a grasp, and all closed hands; on request
+  clutter.hdf5             the same for scenes of several objects; on request
   reject.json              grasps that an inspection rejects; only if there are any
   build.lock               process that builds; only while a build runs
 ```
@@ -88,10 +89,10 @@ changelog states what each version changed.
 
 A seal is the SHA-256 of a file, in its first 512 bytes, which HDF5 leaves free. Shards and the
 files in `objects/` are sealed: a changed bit in one of them is detected when the file is used. The
-three main files and `scenes.hdf5` are sealed, too; `drakegrasp check` verifies their seals, which
-reads the files as a whole. `drakegrasp assemble` rebuilds the three files from the shards; a build
-does so by itself if they do not match the present shards and manifest. A list of
-rejected trials (`assemble --reject`) is kept in the manifest until the next `assemble`.
+three main files, `scenes.hdf5` and `clutter.hdf5` are sealed, too; `drakegrasp check` verifies
+their seals, which reads the files as a whole. `drakegrasp assemble` rebuilds the three files from
+the shards; a build does so by itself if they do not match the present shards and manifest. A list
+of rejected trials (`assemble --reject`) is kept in the manifest until the next `assemble`.
 
 New files get their names one after the other, and the manifest is the last. A process that is
 killed meanwhile leaves files without the `signature` of the manifest: `drakegrasp check` reports
@@ -153,6 +154,11 @@ scene is an object in a resting pose, somewhere on the table. All cameras of a s
 colours and its light, and each camera has its own depth noise. The file has the attributes of
 `trials.hdf5` except `K`; `near` and `far` are those of its cameras. Images are stored in one chunk
 each, gzip 1. Unlike in the data files, values are NaN where no lift was tried.
+
+`drakegrasp clutter` writes `clutter.hdf5` with the same groups, see [grasps among other
+objects](../how-to/clutter.md). There `o` is the largest number of objects of a scene, and `/grasps`
+has the samples of all of them. Its attribute `clutter` (JSON) says what was asked for: `objects`,
+`tries`, and the boxes of all `surroundings` by their names.
 
 ### /scenes
 """
