@@ -39,6 +39,7 @@ from drakegrasp.dataset.hdf5 import (
 )
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import (
+    CLUTTER_FILE,
     DATA_FILES,
     MANIFEST_FILE,
     SCENES_FILE,
@@ -50,8 +51,12 @@ from drakegrasp.dataset.paths import (
     recorded_model,
     validate_model_file,
 )
+from drakegrasp.dataset.scenes import TRIED
 from drakegrasp.dataset.schema import (
     CAMERAS,
+    HITS_NOTHING,
+    NO_OBJECT,
+    NOT_TRIED,
     OBJECT_FIELDS,
     POSITIVE,
     ROW_NUMBERS,
@@ -89,7 +94,10 @@ FILES: Mapping[str, Layout] = {
     TRIALS_FILE: TRIALS,
     **dict.fromkeys(DATA_FILES.values(), SAMPLES),
     SCENES_FILE: SCENES,
+    CLUTTER_FILE: SCENES,
 }
+#: Files that a dataset may lack, and the commands that write them.
+ON_REQUEST: Mapping[str, str] = {SCENES_FILE: "scenes", CLUTTER_FILE: "clutter"}
 #: Attributes that identify the state of a dataset that a file is of.
 STATE = ("signature", "shards")
 
@@ -106,6 +114,10 @@ MASK_TOLERANCE = 2.0  # [px]
 #: Columns of codes, by their group and name.
 CODES: Mapping[tuple[str, str], list[int]] = {
     ("trials", "outcome"): [each.value for each in Outcome if not each.verification_only],
+    ("grasps", "outcome"): [
+        *(each.value for each in Outcome if not each.verification_only),
+        NOT_TRIED,
+    ],
     ("successes", "removal"): [each.value for each in Removal],
 }
 #: Groups whose rows have a value in every field from its stage on.
@@ -208,7 +220,7 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     cameras = {name: camera for camera, name in DATA_FILES.items()}
     arms = [reach_path(out, name).relative_to(out).as_posix() for name in reach_names(out)]
     for name in (*FILES, *arms):
-        if name == SCENES_FILE and not (out / name).exists():
+        if name in ON_REQUEST and not (out / name).exists():
             continue
         with _reported(found, name, "the file must be there, readable and of this schema"):
             due = file_attributes(manifest, seals, cameras.get(name, ""))
@@ -268,8 +280,8 @@ def _header(path: Path, name: str, due: Mapping[str, Any], found: list[Violation
     # The first other attribute is the cause of the others. Verdicts may get other settings, which
     # are in `config`; scenes and arms have their own attributes.
     keys, command = [*dict.fromkeys((*STATE, *due))], "assemble"
-    if name == SCENES_FILE:
-        keys, command = [*STATE], "scenes"
+    if name in ON_REQUEST:
+        keys, command = [*STATE], ON_REQUEST[name]
     elif name not in FILES:
         keys, command = ["config_hash", "shards"], "reach"
     told = [key for key in keys if key in due and key in attributes and key != "config"]
@@ -438,6 +450,8 @@ def _check_rows(task: _Rows) -> list[Violation]:
         stages += [[_chain], [_in_mask]]
         if task.max_distance is not None:
             stages += [[_as_in_trials], [_on_mesh]]
+    elif task.group == "grasps":
+        stages += [[_as_labelled]]
     elif task.group == "reach":
         stages += [[_as_reached]]
         if task.max_distance is not None:
@@ -485,7 +499,10 @@ def _numbers(t: Table, task: _Rows) -> Iterator[Finding]:
         yield "trial_id must be the number of the row", values != t[NUMBER], values
     for name, of in ROW_NUMBERS.get(task.group, {}).items():
         values = t[name]
-        bad = _any((values < 0) | (values >= task.counts.get(of, np.inf)))
+        unknown = (values < 0) | (values >= task.counts.get(of, np.inf))
+        if values.ndim > 1:  # a scene may have fewer objects than others
+            unknown[:, 1:] &= values[:, 1:] != NO_OBJECT
+        bad = _any(unknown)
         yield f"{name} must be one of the rows of /{of}", bad, values
     for (place, name), known in CODES.items():
         if place == task.group:
@@ -603,6 +620,32 @@ def _differs(values: AnyArray, due: AnyArray, tolerance: float | None = None) ->
     with np.errstate(invalid="ignore"):
         near = np.abs(values - due) <= limit.reshape(-1, *(1,) * (values.ndim - 1))
     return _any(~(same | near))
+
+
+# Grasps in scenes
+
+
+def _as_labelled(t: Table, task: _Rows) -> Iterator[Finding]:
+    """Labels of a grasp do not contradict each other, and its object is in its scene."""
+    outcome, success = t["outcome"], t["outcome"] == Outcome.SUCCESS
+    what = "lifted must be true exactly where outcome is success"
+    yield what, t["lifted"] != success, t["lifted"]
+    what = "kept must be false where outcome is not success"
+    yield what, t["kept"] & ~success, t["kept"]
+    what = "tested must be false where outcome is not that of a lift"
+    yield what, t["tested"] & ~np.isin(outcome, TRIED), t["tested"]
+
+    with reopened(task.path, task.stamp, "a file of a dataset") as file:
+        objects = file["scenes/object"][:]
+    place = np.minimum(t["object"], objects.shape[1] - 1)
+    there = (place == t["object"]) & (objects[t["scene"], place] != NO_OBJECT)
+    yield "object must be that of an object in its scene", ~there, t["object"]
+
+    # Only among others.
+    if t.has("free", "hit", "clean"):
+        what = f"free must be true exactly where hit is {HITS_NOTHING}"
+        yield what, t["free"] != (t["hit"] == HITS_NOTHING), t["free"]
+        yield "clean must be false where the grasp is not kept", t["clean"] & ~t["kept"], t["clean"]
 
 
 # What an arm can do about grasps
