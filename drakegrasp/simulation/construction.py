@@ -17,7 +17,7 @@ plant. Sampled output ports report the contacts of the previous step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -172,22 +172,33 @@ def build_object_scene(
         around: Neighbours and boxes around the object; None if it is alone on the table.
     """
     physics = model.own_physics(physics)
-    surface = resting_surface or model.resting_surface
-    builder, drawn = _draft(model, physics, surface, meshcat, around)
+    # If nothing is around it, the object meets the table alone.
+    surfaces = {"table": resting_surface or model.resting_surface}
+    if around is not None:
+        surfaces = {"hand": model.collision_solid, **surfaces}
+    builder, drawn = _draft(model, physics, surfaces, meshcat, around)
     drawn["plant"].Finalize()
-    _part_surfaces(drawn)
+    if around is not None:
+        _part_surfaces(drawn)
     return ObjectScene(simulator=Simulator(builder.Build()), **drawn)
 
 
 def _draft(
     model: ObjectModel,
     physics: PhysicsConfig,
-    resting_surface: Solid,
+    surfaces: Mapping[str, Solid],
     meshcat: Meshcat | None,
     around: Neighbourhood | None,
 ) -> tuple[DiagramBuilder, dict[str, Any]]:
-    """Return a diagram with the free object and the table, and attributes of `ObjectScene`."""
-    # The free object has one surface for the hand and one for the table.
+    """Return a diagram with the free object and the table, and attributes of `ObjectScene`.
+
+    Args:
+        model: The object.
+        physics: Materials, solver and time step.
+        surfaces: The object's surfaces in {O}, by their contact partners `hand` and `table`.
+        meshcat: Where to show the scene.
+        around: Neighbours and boxes around the object.
+    """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
         time_step=physics.time_step,
@@ -200,8 +211,10 @@ def _draft(
     object_body = plant.AddRigidBody(
         "object", plant.AddModelInstance("object"), object_inertia(model, model.mass)
     )
-    _add_surface(plant, object_body, "hand", model.collision_solid, physics)
-    table_side = _add_surface(plant, object_body, "table", resting_surface, physics)
+    sides = {
+        name: _add_surface(plant, object_body, name, surface, physics)
+        for name, surface in surfaces.items()
+    }
     table = _add_table(plant, scene_graph, physics)
     surrounding = {} if around is None else _add_around(plant, object_body, model, around, physics)
 
@@ -218,7 +231,7 @@ def _draft(
         "plant": plant,
         "scene_graph": scene_graph,
         "object": object_body,
-        "table_side": table_side,
+        "table_side": sides["table"],
         "table": table,
         **surrounding,
     }
@@ -233,7 +246,8 @@ def _build(
     own_motors: bool,
 ) -> Scene:
     # The object on the table, and the hand on its wrist, which follows a trajectory.
-    builder, drawn = _draft(model, physics, model.resting_surface, meshcat, around)
+    surfaces = {"hand": model.collision_solid, "table": model.resting_surface}
+    builder, drawn = _draft(model, physics, surfaces, meshcat, around)
     plant, scene_graph = drawn["plant"], drawn["scene_graph"]
     trajectory = builder.AddSystem(
         TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)

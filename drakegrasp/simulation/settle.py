@@ -6,7 +6,9 @@ Input: a prepared object. Output: its resting pose X_TO, moved in x and y so tha
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -96,12 +98,20 @@ def find_resting_poses(model: ObjectModel, config: Config) -> list[Resting]:
         MeshError: As `settle`, for the first drop.
     """
     found, counts = [settle(model, config)], [1]
+
+    # A drop from a random orientation has no earlier pose to keep. It starts at the table, with
+    # longer steps and the surface of lifts, and comes to rest at a fifth of the cost. These drops
+    # share a scene.
+    rules = config.settle.model_copy(update={"drop_height": 0.0, "time_step": RANDOM_STEP})
+    eased = config.model_copy(update={"settle": rules})
+    shared = cache(lambda: _scene_of(model, eased, model.resting_surface))
     for drop in range(1, config.objects.resting_poses):
         stream = Stream(config.seed, object_key(model.name), drop, Draw.DROP)
         # Four normal random numbers, normalised, are a uniform quaternion (Muller 1959).
         try:
-            resting = settle(model, config, rotation_of(stream.normal(4)))
+            resting = _settle(model, eased, rotation_of(stream.normal(4)), shared)
         except MeshError:
+            shared.cache_clear()  # a scene is not used again after a failure
             continue
 
         # The third row of R_TO is the upward direction in {O}.
@@ -118,11 +128,11 @@ def find_resting_poses(model: ObjectModel, config: Config) -> list[Resting]:
     ]
 
 
-def settle(model: ObjectModel, config: Config, R_TO: Array | None = None) -> Resting:
-    """Return the resting pose of an object that is dropped.
+def settle(model: ObjectModel, config: Config) -> Resting:
+    """Return the resting pose of an object that is dropped with {O} aligned to {T}.
 
     The origin of {O} starts at `settle.drop_height` above the table (Veres et al.). If the object
-    is taller, or has a given orientation, its lowest point starts just on the table.
+    is taller, its lowest point starts just on the table.
 
     Hydroelastic contact has no rolling resistance, so a round object may roll for a very long time.
     After `STOP_FRACTION` of `settle.max_time`, each check therefore sets the velocity of an object
@@ -131,35 +141,48 @@ def settle(model: ObjectModel, config: Config, R_TO: Array | None = None) -> Res
     Args:
         model: The object.
         config: How the object settles.
-        R_TO: Orientation of the object when it is dropped, (3, 3); None aligns {O} to {T}.
 
     Raises:
         MeshError: If the object leaves the table, never comes to rest, or Drake cannot
             simulate it.
     """
+    # The paper's drop keeps the fall, the step and the surface that decided the pose in earlier
+    # datasets.
+    return _settle(
+        model, config, np.eye(3), lambda: _scene_of(model, config, settling_surface(model))
+    )
+
+
+def _scene_of(model: ObjectModel, config: Config, surface: Solid) -> ObjectScene:
+    """Return a scene with the time step of settling, in which a surface meets the table."""
+    physics = config.physics.model_copy(update={"time_step": config.settle.time_step})
+    return build_object_scene(model, physics, resting_surface=surface)
+
+
+def _settle(
+    model: ObjectModel, config: Config, R_TO: Array, build: Callable[[], ObjectScene]
+) -> Resting:
+    """Return the resting pose of an object that is dropped with an orientation; see `settle`.
+
+    Args:
+        model: The object.
+        config: How the object settles.
+        R_TO: Orientation of the object when it is dropped, (3, 3).
+        build: Returns the scene.
+    """
     try:
-        # The paper's drop keeps the fall, the step and the surface that decided the pose in earlier
-        # datasets.
-        if R_TO is None:
-            return _settle(model, config, np.eye(3), settling_surface(model))
-        # A drop from a random orientation has no earlier pose to keep. It starts at the table, with
-        # longer steps and the surface of lifts, and comes to rest at a fifth of the cost.
-        rules = config.settle.model_copy(update={"drop_height": 0.0, "time_step": RANDOM_STEP})
-        eased = config.model_copy(update={"settle": rules})
-        return _settle(model, eased, R_TO, model.resting_surface)
+        return _drop(build(), config, R_TO)
     # A failed assertion in Drake arrives as SystemExit.
     except (RuntimeError, SystemExit) as error:
         reason = first_line(error)
         raise MeshError(f"{model.name}: Drake failed while dropping it: {reason}") from None
 
 
-def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> Resting:
+def _drop(scene: ObjectScene, config: Config, R_TO: Array) -> Resting:
     # Free fall does not turn the object, so the simulation begins where it touches the table. If it
     # began higher, the first step in contact would find the object millimetres deep in the table
     # and throw it up and over.
-    rules = config.settle
-    physics = config.physics.model_copy(update={"time_step": rules.time_step})
-    scene = build_object_scene(model, physics, resting_surface=surface)
+    model, rules = scene.model, config.settle
     lowest = float(dot(model.collision_vertices, R_TO[2]).min())
     fall = max(rules.drop_height + lowest, 0.0)
     reset_object(scene, multiply(X_WT, make_pose(R_TO, [0.0, 0.0, -lowest])))

@@ -25,7 +25,7 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation import settle as settle_module
 from drakegrasp.simulation.construction import build_object_scene
 from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
-from drakegrasp.simulation.settle import Resting, settle, snapped
+from drakegrasp.simulation.settle import Resting, find_resting_poses, settle, snapped
 
 pytestmark = pytest.mark.sim
 
@@ -293,3 +293,30 @@ def test_rest_begins_again_when_the_object_moves_again(
     rules = override_config(config, ["settle.rest_time=0.19", "settle.max_time=10"])
     resting = settle(as_dropped(trimesh.creation.box([0.05] * 3)), rules)
     assert resting.seconds == pytest.approx(0.05 * checks)
+
+
+def test_drops_that_share_a_scene_rest_as_if_each_had_its_own(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+):
+    """To the bit. One scene is for the first drop and one for all others."""
+    built, build = [], settle_module.build_object_scene
+
+    def watch(*args: Any, **kwargs: Any) -> ObjectScene:
+        built.append(build(*args, **kwargs))
+        return built[-1]
+
+    monkeypatch.setattr(settle_module, "build_object_scene", watch)
+    box = as_dropped(trimesh.creation.box([0.05, 0.06, 0.08]))
+    rules = override_config(config, ["objects.resting_poses=5"])
+    shared, scenes = find_resting_poses(box, rules), len(built)
+    monkeypatch.setattr(settle_module, "cache", lambda build: build)
+    alone = find_resting_poses(box, rules)
+    assert (scenes, len(built) - scenes) == (2, 5)
+    assert len(shared) > 2
+    for a, b in zip(shared, alone, strict=True):
+        assert np.array_equal(a.X_TO, b.X_TO)
+        assert (a.seconds, a.table_force, a.probability) == (
+            b.seconds,
+            b.table_force,
+            b.probability,
+        )
