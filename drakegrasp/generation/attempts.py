@@ -29,7 +29,6 @@ from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.attempt import Attempt, Conditions, draw_conditions, usual_conditions
 from drakegrasp.simulation.attempts import posture_attempts
 from drakegrasp.simulation.candidates import palm_attempts
@@ -119,7 +118,6 @@ def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObj
             f"{out}: the prepared {name} must be of the work unit's mesh {mesh_sha256[:12]}, "
             f"got {prepared.model.mesh_sha256[:12]}"
         )
-    release_memory()  # from earlier objects and their preparation
     return prepared
 
 

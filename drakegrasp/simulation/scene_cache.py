@@ -8,7 +8,6 @@ scene that is reset gives the same bits as a new scene, so earlier use changes n
 from __future__ import annotations
 
 import ctypes
-import gc
 import hashlib
 import threading
 from collections.abc import Callable
@@ -29,6 +28,7 @@ from drakegrasp.config import (
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.surroundings import Neighbourhood
+from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.attempt import Attempt, disturbed, usual_conditions
 from drakegrasp.simulation.closing import centred
 from drakegrasp.simulation.construction import build_scene
@@ -63,17 +63,25 @@ def _content(model: ObjectModel, *arrays: npt.NDArray[np.generic] | np.float64) 
 @lru_cache(maxsize=KEPT)
 def _scenes(content: _Content, physics: PhysicsConfig, hand: Hand) -> Callable[[int | None], Scene]:
     """Return a function that returns the scene of a preshape, the same one in each call."""
-    # Diagrams are in reference cycles and own memory that Python does not count, so those that
-    # were dropped are freed before others are built.
-    gc.collect()
+    _free_dropped(_scenes.cache_info().misses)
     around = content.around
     return cache(lambda shape: build_scene(content.model, physics, hand.at(shape), around=around))
 
 
 @lru_cache(maxsize=KEPT)
 def _renderer(content: _Content, config: CameraConfig) -> Renderer:
-    gc.collect()
+    _free_dropped(_renderer.cache_info().misses)
     return build_renderer(content.model, config)
+
+
+def _free_dropped(number: int) -> None:
+    """Free what a cache has dropped when it makes the entry of a number, counted from one.
+
+    Diagrams are in reference cycles and own memory that Python does not count. An entry is dropped
+    after the next one was made, so the first `KEPT` + 1 find nothing to free.
+    """
+    if number > KEPT + 1:
+        release_memory()
 
 
 # At the end of the process, cached renderers would be destroyed in another thread than the one that
