@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import re
 import stat
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NoReturn
 from zipfile import ZipFile
@@ -93,11 +94,11 @@ def read_content(path: Path, largest: int = LARGEST_CONTENT) -> bytes:
     return path.read_bytes()
 
 
-def read_npz(path: Path, largest: int = LARGEST_CONTENT) -> dict[str, Any]:
+def read_npz(source: Path | BytesIO, largest: int = LARGEST_CONTENT) -> dict[str, Any]:
     """Return the arrays of a .npz file by their names.
 
     Args:
-        path: Path of the file.
+        source: The file, or its content.
         largest: Maximum size of the file and of its arrays [bytes]; a small file can unpack to
             terabytes.
 
@@ -107,8 +108,9 @@ def read_npz(path: Path, largest: int = LARGEST_CONTENT) -> dict[str, Any]:
     """
     import numpy as np
 
-    validate_regular(path, largest)
-    with path.open("rb") as file:
+    if isinstance(source, Path):
+        validate_regular(source, largest)
+    with source.open("rb") if isinstance(source, Path) else source as file:
         with ZipFile(file) as packed:
             size = sum(item.file_size for item in packed.infolist())
         if size > largest:

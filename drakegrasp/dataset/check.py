@@ -48,8 +48,8 @@ from drakegrasp.dataset.paths import (
     plan_path,
     reach_names,
     reach_path,
+    read_model_file,
     recorded_model,
-    validate_model_file,
 )
 from drakegrasp.dataset.scenes import TRIED
 from drakegrasp.dataset.schema import (
@@ -344,12 +344,13 @@ def _check_object(out: Path, entry: ObjectEntry, headers: Iterable[ShardHeader])
     """
     found, model, plan = list[Violation](), model_path(out, entry.name), plan_path(out, entry.name)
     names = {path: path.relative_to(out).as_posix() for path in (model, plan)}
+    content = None
     with _reported(found, names[plan], "the plan must be as it was written"):
         expected = recorded_model(out, entry.name)
         with _reported(found, names[model], "the meshes must be as they were written"):
-            validate_model_file(out, entry.name, expected)
+            content = read_model_file(out, entry.name, expected)
     with _reported(found, names[model], f"the meshes must be those of {MANIFEST_FILE}"):
-        if (sha256 := load_object(model).mesh_sha256) != entry.mesh_sha256:
+        if (sha256 := load_object(model, content).mesh_sha256) != entry.mesh_sha256:
             raise DataError(f"mesh_sha256 must be {entry.mesh_sha256}, got {sha256}")
     for header in headers:
         path = header.path(out)

@@ -79,11 +79,6 @@ def _file_name(name: str) -> str:
     return name
 
 
-def model_file_sha256(out: Path, name: str) -> str:
-    """Return the hexadecimal hash of the file of an object's meshes."""
-    return hashlib.sha256(read_content(model_path(out, name))).hexdigest()
-
-
 def recorded_model(out: Path, name: str) -> str:
     """Return the hexadecimal hash of an object's mesh file that its plan stores.
 
@@ -98,13 +93,15 @@ def recorded_model(out: Path, name: str) -> str:
         return str(file.attrs["model_sha256"])
 
 
-def validate_model_file(out: Path, name: str, expected: str) -> None:
-    """Reject the file of an object's meshes if it is missing or its hash differs from `expected`.
+def read_model_file(out: Path, name: str, expected: str) -> bytes:
+    """Return the content of the file of an object's meshes.
 
     Raises:
-        DataError: If the file is rejected.
+        DataError: If the file is missing or its hexadecimal hash differs from `expected`.
     """
     model = model_path(out, name)
-    if not model.is_file() or model_file_sha256(out, name) != expected:
-        got = "other content" if model.is_file() else "none"
+    content = read_content(model) if model.is_file() else None
+    if content is None or hashlib.sha256(content).hexdigest() != expected:
+        got = "none" if content is None else "other content"
         raise DataError(f"{model}: must be the file that was written with its plan, got {got}")
+    return content

@@ -18,18 +18,12 @@ import numpy.typing as npt
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, opened
 from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry
-from drakegrasp.dataset.paths import (
-    model_file_sha256,
-    model_path,
-    plan_path,
-    recorded_model,
-    validate_model_file,
-)
+from drakegrasp.dataset.paths import model_path, plan_path, read_model_file
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
-from drakegrasp.runtime.files import atomic_hdf5
+from drakegrasp.runtime.files import atomic_hdf5, validate_seal
 from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.table import Table
 
@@ -114,9 +108,9 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         config: Configuration of the dataset.
     """
     model, candidates = prepared.model, prepared.candidates
-    save_object(model, model_path(out, model.name))
+    sha256 = save_object(model, model_path(out, model.name))
     with atomic_hdf5(plan_path(out, model.name), sealed=True) as file:
-        file.attrs["model_sha256"] = model_file_sha256(out, model.name)
+        file.attrs["model_sha256"] = sha256
         file.attrs["config_hash"] = config.simulation_hash()
         file.attrs["mesh_sha256"] = model.mesh_sha256
         file.attrs["asked"] = prepared.asked
@@ -145,16 +139,17 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     path = plan_path(out, name)
 
     # Both files must be unchanged, and belong to this configuration.
-    validate_model_file(out, name, recorded_model(out, name))
+    validate_seal(path, "plan of an object")
     with opened(path, "the plan of an object") as file:
         attributes = dict(file.attrs)
         resting, palms = ({name: file[name][:] for name in names} for names in (_RESTING, _PALMS))
         given = {name: file[name][:] for name in (*_POSTURES, "preshape") if name in file}
+    content = read_model_file(out, name, str(attributes["model_sha256"]))
     due = config.simulation_hash()
     if attributes["config_hash"] != due:
         raise DataError(f"{path}: must be of configuration {due}, got {attributes['config_hash']}")
     return PreparedObject(
-        model=load_object(model_path(out, name)),
+        model=load_object(model_path(out, name), content),
         resting_poses=resting.pop("X_TO"),
         **resting,
         candidates=Candidates(**palms, postures=_given_postures(given)),

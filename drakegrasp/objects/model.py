@@ -9,6 +9,7 @@ mesh is refused with a `MeshError`.
 
 from __future__ import annotations
 
+import hashlib
 import io
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -323,8 +324,8 @@ def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
 # Storage
 
 
-def save_object(model: ObjectModel, path: str | Path) -> None:
-    """Write an object to a .npz file, atomically; equal objects produce equal bytes."""
+def save_object(model: ObjectModel, path: str | Path) -> str:
+    """Write an object to a .npz file, atomically, and return the file's hexadecimal hash."""
     # Equal objects produce equal bytes, since `np.savez` stores no time stamps.
     content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
     content["notes"] = np.array(model.notes, dtype=np.str_)
@@ -332,10 +333,15 @@ def save_object(model: ObjectModel, path: str | Path) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **content)
     write_atomic(Path(path), buffer.getvalue())
+    return hashlib.sha256(buffer.getbuffer()).hexdigest()
 
 
-def load_object(path: str | Path) -> ObjectModel:
+def load_object(path: str | Path, content: bytes | None = None) -> ObjectModel:
     """Return an object that `save_object` wrote.
+
+    Args:
+        path: Path of the file.
+        content: Content of the file; None: it is read now.
 
     Raises:
         MeshError: If the file is missing, damaged or something else.
@@ -343,8 +349,8 @@ def load_object(path: str | Path) -> ObjectModel:
     # Read the arrays as they are in the file.
     path = Path(path)
     try:
-        content = read_npz(path)
-        values: dict[str, Any] = {f.name: content[f.name] for f in fields(ObjectModel)}
+        arrays = read_npz(path if content is None else io.BytesIO(content))
+        values: dict[str, Any] = {f.name: arrays[f.name] for f in fields(ObjectModel)}
     except Exception as error:
         raise MeshError(
             f"{path.name}: must be an object file of drakegrasp, got: {one_line(error)}"
