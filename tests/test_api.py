@@ -17,7 +17,7 @@ import trimesh
 from distributed import Client
 from helpers.datasets import make_dataset
 
-from drakegrasp.api import building, verifying
+from drakegrasp.api import building
 from drakegrasp.api.building import build_dataset
 from drakegrasp.api.verifying import run_verification, verify_grasp, verify_grasps
 from drakegrasp.cluster.connect import connect
@@ -155,9 +155,10 @@ def test_workers_get_tasks_of_few_grasps(
             given.append(len(task))
             yield [(grasp.index, result.findings()) for grasp in task]
 
-    monkeypatch.setattr(verifying, "joined", lambda *_: nullcontext(client))
-    monkeypatch.setattr(verifying, "checked_workers", lambda *_: nullcontext())
-    monkeypatch.setattr(verifying, "DaskExecutor", lambda _: execute)
+    monkeypatch.setattr("drakegrasp.cluster.connect.joined", lambda *_: nullcontext(client))
+    checked = "drakegrasp.cluster.worker_checks.checked_workers"
+    monkeypatch.setattr(checked, lambda *_: nullcontext())
+    monkeypatch.setattr("drakegrasp.cluster.executor.DaskExecutor", lambda _: execute)
     placed = place(np.tile(GRASP.ravel(), (count, 1)), cube)
     run_verification(placed, cube.config, client=client, show=False)  # type: ignore[arg-type]
     assert given == sizes
@@ -371,7 +372,7 @@ def test_few_grasps_are_verified_in_this_process(
     """Four are few, and five are not."""
     module = "drakegrasp.api.verifying"
     monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
-    monkeypatch.setattr(f"{module}.joined", lambda *_: _none())
+    monkeypatch.setattr("drakegrasp.cluster.connect.joined", lambda *_: _none())
     four, five = (place([GRASP.ravel()] * count, cube) for count in (4, 5))
     assert run_verification(four, cube.config, show=False) == [run_here]
     with pytest.raises(MachineError, match="no workers"):

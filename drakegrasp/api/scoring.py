@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 import numpy.typing as npt
 
 from drakegrasp.api.verifying import run_verification, verify_by_protocol
-from drakegrasp.cluster.connect import Workers
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.reader import GraspDataset
@@ -30,6 +29,8 @@ from drakegrasp.verification.result import Verification
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from drakegrasp.cluster.connect import Workers
 
 #: Folder of the convex parts of objects, for protocols of MuJoCo.
 CONVEX_PARTS = "convex_parts"

@@ -16,9 +16,6 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.cluster.connect import Workers, joined
-from drakegrasp.cluster.executor import DaskExecutor
-from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
@@ -47,6 +44,8 @@ from drakegrasp.verification.verify import ResultCallback, ignore_result, verify
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from drakegrasp.cluster.connect import Workers
 
 #: Source of an object on the table: a mesh file, a mesh, or a placed object.
 ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | PlacedObject
@@ -265,12 +264,20 @@ def run_verification(
     """
     # A worker of another process pool may not start processes.
     few = len(grasps) <= FEW_GRASPS or multiprocessing.current_process().daemon
-    elsewhere = client or workers.get("scheduler") or workers.get("scheduler_file")
-    cluster = joined(client, workers) if elsewhere or workers or not few else None
-    alone = not elsewhere and (few or count_workers(workers.get("workers")) == 1)
-    if cluster is None or alone or not grasps:
+    asked = {name for name, value in workers.items() if value is not None}
+    here = client is None and asked <= {"workers", "tls"} and workers.get("tls", True)
+    if here and (count_workers(workers.get("workers")) == 1 or few):
         with progress_bar("verify", "grasps", show=show) as report:
             return verify_batch(grasps, run_here, report, on_result, explained=explained)
+
+    # Importing Dask takes a third of a second.
+    from drakegrasp.cluster.connect import joined
+    from drakegrasp.cluster.executor import DaskExecutor
+    from drakegrasp.cluster.worker_checks import checked_workers
+
+    cluster = joined(client, workers)
+    if not grasps:
+        return []
     with (
         cluster as joint,
         progress_bar("verify", "grasps", show=show) as report,
