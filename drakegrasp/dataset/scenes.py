@@ -734,5 +734,5 @@ def validate_state(path: Path, trials: Trials) -> None:
             if str(file.attrs.get(key)) != str(trials.attributes.get(key)):
                 raise DataError(
                     f"{path}: must be of the trials in its folder, got other scenes; run "
-                    "`drakegrasp scenes` again"
+                    f"`drakegrasp {path.stem}` again"
                 )

@@ -31,7 +31,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from drakegrasp.dataset.paths import ASSEMBLED_FILES, SCENES_FILE
+from drakegrasp.dataset.paths import ASSEMBLED_FILES
 from drakegrasp.dataset.rejections import (
     REJECT_FILE,
     AttemptKey,
@@ -46,9 +46,9 @@ from drakegrasp.page.attempts import AttemptGallery
 from drakegrasp.page.gallery import Gallery, render
 from drakegrasp.page.predictions import Predictions, result_file
 from drakegrasp.page.renders import HandView, arm_surface, object_surface, read_render
-from drakegrasp.page.scenes import Scenes
+from drakegrasp.page.scenes import Clutter, Scenes
 from drakegrasp.page.snapshot import read_snapshot
-from drakegrasp.pictures.style import colour_png, strip_png
+from drakegrasp.pictures.style import strip_png
 
 ASSETS = Path(__file__).parent / "static"
 #: The only address that the server listens on.
@@ -66,6 +66,8 @@ HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "cache-control": "no-store",
 }
+#: Tables of files that a command makes from a dataset.
+MADE: tuple[type[Scenes], ...] = (Scenes, Clutter)
 #: Maximum size of a POST [B].
 MAX_BODY = 4096
 Params: TypeAlias = Mapping[str, str]
@@ -153,7 +155,8 @@ class Inspection:
 
     def __init__(self, out: Path, results: Path | None = None) -> None:
         found = None if results is None else result_file(results)
-        watched = [*(out / name for name in (*ASSEMBLED_FILES, SCENES_FILE)), found]
+        made = (kind.FILE for kind in MADE)
+        watched = [*(out / name for name in (*ASSEMBLED_FILES, *made)), found]
         self._stamps = {path: stamp(path) for path in watched if path is not None}
         self.snapshot = read_snapshot(out)
         self.decisions = DecisionFile(out)
@@ -162,7 +165,6 @@ class Inspection:
         self._fixed: dict[type[Gallery], Gallery] = {}
         if found is not None:
             self._fixed[Predictions] = Predictions(found, self.snapshot)
-        self._scenes = out / SCENES_FILE
         self._lock = threading.Lock()
 
     def galleries(self) -> list[type[Gallery]]:
@@ -170,9 +172,7 @@ class Inspection:
         found: list[type[Gallery]] = [AttemptGallery]
         if Predictions in self._fixed:
             found.append(Predictions)
-        if os.path.lexists(self._scenes):
-            found.append(Scenes)
-        return found
+        return found + [kind for kind in MADE if os.path.lexists(self.snapshot.out / kind.FILE)]
 
     def table(self, kind: type[Gallery]) -> Gallery:
         """Return the present state of a table.
@@ -182,13 +182,13 @@ class Inspection:
             DataError: If its file cannot be read, or belongs to another dataset.
         """
         if kind not in self.galleries():
-            how = "drakegrasp scenes makes them" if kind is Scenes else "give --predictions"
+            how = f"drakegrasp {kind.HOME[1:]} makes them" if kind in MADE else "give --predictions"
             raise HTTPException(404, f"there are no {kind.NOUN}s: {how}")
         if kind is AttemptGallery:
             return AttemptGallery(self.snapshot, self.decisions.read(), self.token)
         with self._lock:
-            if kind not in self._fixed:
-                self._fixed[kind] = Scenes(self._scenes, self.snapshot)
+            if kind not in self._fixed and issubclass(kind, Scenes):
+                self._fixed[kind] = kind(self.snapshot)
             return self._fixed[kind]
 
     def validate_unchanged(self) -> None:
@@ -228,14 +228,14 @@ def _row(kind: type[Gallery], inspection: Inspection, name: str, params: Params)
     return HTMLResponse(page)
 
 
-def _view(inspection: Inspection, name: str, params: Params) -> Response:
-    scenes = inspection.table(Scenes)
+def _view(kind: type[Scenes], inspection: Inspection, name: str, params: Params) -> Response:
+    scenes = inspection.table(kind)
     assert isinstance(scenes, Scenes)
     scene, _, number = name.partition("-")
     views = scenes.views(_there(scenes.find(scene), "scene"))
     known = {str(k): int(view) for k, view in enumerate(views)}
-    colours, *_ = scenes.data.stored_images(_there(known.get(number), "view"))
-    return Response(colour_png(colours), media_type="image/png")
+    png = scenes.picture(_there(known.get(number), "view"))
+    return Response(png, media_type="image/png")
 
 
 def _strip(inspection: Inspection, name: str, params: Params) -> Response:
@@ -279,14 +279,13 @@ def _there(found: Any, noun: str) -> Any:
 
 
 Answer: TypeAlias = Callable[[Inspection, str, Params], Response]
+#: All tables.
+KINDS: tuple[type[Gallery], ...] = (AttemptGallery, Predictions, *MADE)
 #: Function that answers each address: galleries and rows of tables, and parts of pages.
 PAGES: dict[str, Answer] = {
-    **{kind.HOME: partial(_gallery, kind) for kind in (AttemptGallery, Predictions, Scenes)},
-    **{
-        f"/{kind.ROW}/{{name}}": partial(_row, kind)
-        for kind in (AttemptGallery, Predictions, Scenes)
-    },
-    "/view/{name}.png": _view,
+    **{kind.HOME: partial(_gallery, kind) for kind in KINDS},
+    **{f"/{kind.ROW}/{{name}}": partial(_row, kind) for kind in KINDS},
+    **{f"{kind.VIEWS}/{{name}}.png": partial(_view, kind) for kind in MADE},
     "/strip/{name}.png": _strip,
     "/mesh/{name}.json": _mesh,
     "/arm/{name}.json": _arm,

@@ -155,6 +155,10 @@ class Gallery(ABC):
             there = {label for label, code in CODES[name].items() if code in used}
         return {v: v.replace("_", " ") for v in self.CHOICES[name] if v in there}
 
+    def of_objects(self, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Return which rows (n,) are of objects that are wanted, by their numbers."""
+        return wanted[self.table.object]
+
     def identity(self, i: int) -> dict[str, Any]:
         """Return how people name a row: by its object's name and class."""
         number = self.table.object[i]
@@ -199,7 +203,7 @@ class Gallery(ABC):
         own = zip(self.snapshot.names, self.snapshot.classes, strict=True)
         asked = query["object"], query["class"]
         wanted = [all(a in ("", b) for a, b in zip(asked, names, strict=True)) for names in own]
-        chosen = np.array(wanted, dtype=bool)[self.table.object]
+        chosen = self.of_objects(np.array(wanted, dtype=bool))
         for name in self.CHOICES:
             if query[name]:
                 chosen &= self.matches(name, query[name])

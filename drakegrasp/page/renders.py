@@ -208,7 +208,7 @@ class HandView:
             return []
         with self._lock:
             scene.pose(X_TG, positions)
-            return [_columns(scene.link_pose(link)) for link in surfaces]
+            return [columns_of(scene.link_pose(link)) for link in surfaces]
 
 
 def attempt_scene(
@@ -264,7 +264,7 @@ def make_scene(
         hand: Hand of the dataset.
     """
     return {
-        "object": _columns(X_TO),
+        "object": columns_of(X_TO),
         "objectNumber": number,
         "objectName": snapshot.names[number],
         "hasObject": find_model(snapshot.out, snapshot.names[number]) is not None,
@@ -307,7 +307,7 @@ def contacts_in_table(
     ]
 
 
-def _columns(X: Array) -> list[float]:
+def columns_of(X: Array) -> list[float]:
     """Return a pose as sixteen numbers, column by column, rounded to six decimals."""
     return [round(value, 6) for value in X.T.ravel().tolist()]
 

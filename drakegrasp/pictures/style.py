@@ -16,7 +16,7 @@ import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap
+from matplotlib.colors import Colormap, to_hex, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from matplotlib.lines import Line2D
@@ -35,6 +35,10 @@ PREDICTED, REACHED, TRUE = "#0072B2", "#D55E00", "#009E73"
 FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
 #: Colour of an arm, which does not move, and how opaque it is if it can be seen through.
 STILL, SEEN_THROUGH = (0.6, 0.66, 0.74), 0.25
+#: Colours of the objects of a scene by their index, the strong ones first; two for each hue.
+INSTANCE_COLOURS = tuple(
+    to_hex(colour) for colour in mpl.colormaps["tab20"]([*range(0, 20, 2), *range(1, 20, 2)])
+)
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
 #: A contact that is farther than this behind the depth image counts as hidden [m]; fingertips are
@@ -244,6 +248,16 @@ def strip_png(image: npt.NDArray[np.float32], mask: npt.NDArray[np.uint8], *, fa
     colours = np.dstack([colours, np.full(colours.shape[:2], 255, dtype=np.uint8)])
     strip = np.concatenate([colours, depths, MASK[(mask > 0).astype(int)]], axis=1)
     return colour_png(strip)
+
+
+def instances_png(colours: npt.NDArray[np.uint8], mask: npt.NDArray[np.uint8]) -> bytes:
+    """Return colours (h, w, 3) beside a mask (h, w) as a PNG, (h, 2 w) pixels.
+
+    The mask has 1 + the index of the object, which is drawn in one of INSTANCE_COLOURS.
+    """
+    palette = np.vstack([NO_DEPTH, np.rint(255.0 * to_rgba_array(INSTANCE_COLOURS))])
+    known = np.dstack([colours, np.full(mask.shape, 255, dtype=np.uint8)])
+    return colour_png(np.concatenate([known, palette[mask].astype(np.uint8)], axis=1))
 
 
 def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:

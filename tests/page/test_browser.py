@@ -26,7 +26,9 @@ from drakegrasp.dataset.rejections import (
     read_decisions,
 )
 from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.generation.scenes import make_scenes
+from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.page.app import Inspection, listen, make_app
 from drakegrasp.page.snapshot import Snapshot, read_snapshot
 from drakegrasp.reach.arm import load_arm
@@ -392,3 +394,33 @@ def test_scenes_filter_and_open(page: Page, out: Path) -> None:
             of_test = int(np.count_nonzero(file["scenes/split"][:] == SPLITS.index("test")))
         assert 0 < of_test < 3
         wait_for_cards(page, of_test)
+
+
+@pytest.mark.sim
+def test_scenes_of_several_objects_open(page: Page, out: Path) -> None:
+    around = [load_surroundings("bin")]
+    make_clutter(out, ClutterRequest(scenes=2, objects=(3, 3), surroundings=around, tries=1))
+    for address in serve(out):
+        for width, height in SIZES.values():
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto(address)
+            page.click("text=Clutter")
+            page.wait_for_load_state("networkidle")
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            page.click("#cards li:nth-child(2) a")
+            wait_for_view(page)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.get_attribute("#view3d", "data-ready") == "yes"
+        # The best hand is shown first; neighbours and walls can be hidden.
+        assert page.get_attribute("#view3d", "data-state") == page.inner_text("button[data-state]")
+        shots = {page.locator("#view3d").screenshot()}
+        for key in ("r", "o"):
+            page.keyboard.press(key)
+            shots.add(page.locator("#view3d").screenshot())
+        assert len(shots) == 3
+        for theme in ("light", "dark"):
+            page.select_option("#theme", theme)
+            contrast, text = page.evaluate(CONTRAST)
+            assert contrast >= 4.5, f"{theme}: {text!r} has {contrast:.2f}"
+        page.keyboard.press("g")
+        page.wait_for_url("**/clutter")

@@ -42,7 +42,8 @@
   const contacts = new THREE.Group();
   const forces = new THREE.Group();
   const palms = new THREE.Group();
-  const layers = { hand, object, contacts, forces, palms };
+  const around = new THREE.Group();
+  const layers = { hand, object, contacts, forces, palms, around };
   for (const kind of Object.keys(kinds || {})) layers[kind] = new THREE.Group();
   // Arms are loaded when they are first shown.
   const arms = Object.keys(data.arms).map((name) => (layers[name] = new THREE.Group()));
@@ -52,6 +53,19 @@
     group.matrix.fromArray(columns);
   };
   place(object, data.object);
+  // Around the object in a scene of several: its neighbours, and boxes that never move.
+  const others = (data.others || []).map(({ pose }) => {
+    const other = new THREE.Group();
+    place(other, pose);
+    around.add(other);
+    return other;
+  });
+  for (const { size, pose } of data.boxes || []) {
+    const look = { color: "#8d949d", roughness: 1, transparent: true, opacity: 0.35, depthWrite: false };
+    const box = new THREE.Mesh(new THREE.BoxGeometry(...size), new THREE.MeshStandardMaterial(look));
+    place(box, pose);
+    around.add(box);
+  }
   const links = meshes.links.map(() => new THREE.Group());
   links.forEach((link) => hand.add(link));
 
@@ -147,14 +161,14 @@
     return new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   }
 
-  async function load(url, group) {
+  async function load(url, group, colour) {
     const answer = await fetch(url);
     if (!answer.ok) throw new Error(`${url}: ${answer.status}`);
     for (const part of await answer.json()) {
       const surface = new THREE.BufferGeometry();
       surface.setAttribute("position", new THREE.BufferAttribute(numbers(part.vertices, Float32Array), 3));
       surface.setIndex(new THREE.BufferAttribute(numbers(part.faces, Uint32Array), 1));
-      const look = { color: part.colour, metalness: 0, roughness: 0.75, flatShading: true };
+      const look = { color: colour || part.colour, metalness: 0, roughness: 0.75, flatShading: true };
       if (group.parent === hand) Object.assign(look, { transparent: true, opacity: 0.8 });
       // The triangles of an arm have no outer side.
       if (part.opacity) Object.assign(look, { transparent: part.opacity < 1, opacity: part.opacity, side: THREE.DoubleSide });
@@ -164,6 +178,7 @@
 
   function aim() {
     const bounds = new THREE.Box3().setFromObject(object);
+    for (const other of others) bounds.expandByObject(other);
     if (bounds.isEmpty()) bounds.set(new THREE.Vector3(-0.05, -0.05, 0), new THREE.Vector3(0.05, 0.05, 0.1));
     const all = new THREE.Box3().setFromObject(hand).union(bounds).union(new THREE.Box3().setFromObject(palms));
     for (const arm of arms) if (arm.visible) all.expandByObject(arm);
@@ -178,10 +193,12 @@
     controls.update();
   }
 
-  const names = Object.keys(data.states);
+  const names = [...document.querySelectorAll("button[data-state]")].map((button) => button.dataset.state);
   const first = names.includes("closed") ? "closed" : names[0];
   const jobs = meshes.links.map((url, i) => load(url, links[i]));
-  if (data.hasObject) jobs.push(load(meshes.object, object));
+  const instances = data.colours || [];
+  if (data.hasObject) jobs.push(load(meshes.object, object, instances[0]));
+  others.forEach((other, i) => jobs.push(load(data.others[i].mesh, other, instances[i + 1])));
   Promise.allSettled(jobs).then((results) => {
     const failed = results.find((result) => result.status === "rejected");
     if (failed) note.textContent = `A mesh cannot be shown: ${failed.reason.message}`;
