@@ -62,12 +62,6 @@ def test_a_sound_dataset_passes(sound: Path, tmp_path: Path, overrides: list[str
     assert broken_physics(out) == {}
 
 
-def test_progress_ends_at_the_total(sound: Path) -> None:
-    seen: list[tuple[int, int | None]] = []
-    check_dataset(sound, progress=lambda done, total, **_: seen.append((done, total)))
-    assert seen == [(done, len(seen)) for done in range(1, len(seen) + 1)]
-
-
 @pytest.mark.nightly
 def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Small tasks, with faults in the first and the last rows, in an object and in a shard."""
@@ -248,11 +242,6 @@ def test_each_file_of_an_object_is_checked(out: Path) -> None:
         *((f"objects/{name}.npz", of_manifest) for name in ("1_box_a", "3_brick")),
     }
     assert "damaged or cut off" in violations[damaged, f"{whole} and of its work unit"]
-
-
-def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"without manifest\.json"):
-        check_dataset(tmp_path)
 
 
 def test_rows_that_break_one_rule_are_counted(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

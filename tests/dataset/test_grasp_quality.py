@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 import pytest
-from helpers.datasets import TRIALS, make_dataset, must_find
 
 from drakegrasp.dataset.quality import (
     CAP,
@@ -17,8 +14,6 @@ from drakegrasp.dataset.quality import (
     PARTS,
     anomaly,
 )
-from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import ROBUST_FIELDS
 from drakegrasp.frames import GRAVITY, make_pose, pack_pose, rotation_about
 from drakegrasp.outcomes import Outcome
 
@@ -165,15 +160,3 @@ def test_sum_of_normals_is_per_finger_of_the_hand(fingers: int) -> None:
         for name, values in firm().items()
     }
     assert anomaly(columns).values["normal_sum"] == pytest.approx(1.0)
-
-
-def test_files_of_builds_with_repeats_alone_have_the_columns(out: Path, tmp_path: Path) -> None:
-    plain = make_dataset(tmp_path / "plain", tmp_path)
-    for path, there in ((out, True), (plain, False)):
-        with h5py.File(path / TRIALS) as trials, h5py.File(path / "grasping_oto.hdf5") as data:
-            for field in ROBUST_FIELDS:
-                assert (field.name in trials["trials"]) is there
-                assert (f"grasp_props/{field.name}" in data["train"]) is there
-        samples = GraspDataset(path / "grasping_oto.hdf5")
-        assert samples[0].grasp_props["robust_tried"] == (4 if there else 0)
-        must_find(path)

@@ -12,52 +12,36 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.data_files import write_data_file
 
 from drakegrasp.dataset import hdf5
 from drakegrasp.dataset.hdf5 import ImageRows, create_field
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, VIEW_FIELDS, sizes
+from drakegrasp.dataset.schema import DATA_FIELDS, VIEW_FIELDS, Field, sizes
 from drakegrasp.errors import DataError, GraspError, MachineError
 from drakegrasp.verification.placing import choose_rows
 
 LETTERS = sizes(fingers=3, joints=8, image=16)
 
 
-def write_data_file(path: Path, trial_ids: range, unused: int = 0) -> Path:
+def write_numbered(path: Path, trial_ids: range, unused: int = 0) -> Path:
     """Write a data file whose train split has its trial's id in every value of a sample.
 
     All grasps leave out the fingers of the bits `unused`.
     """
-    with h5py.File(path, "w") as file:
-        file.attrs["schema_version"] = SCHEMA_VERSION
-        file.attrs["K"] = np.eye(3)
-        file.attrs["near"], file.attrs["far"], file.attrs["seed"] = 0.01, 0.75, 0
-        file.attrs["camera"] = "oto"
-        file.attrs["config"] = file.attrs["versions"] = file.attrs["fingers"] = "{}"
-        file.attrs["joints"], file.attrs["split_by"] = "[]", "object"
-        for key in ("signature", "shards", "config_hash"):
-            file.attrs[key] = "of a test"
-        for split in SPLITS:
-            group = file.create_group(split)
-            ids = trial_ids if split == "train" else range(0)
-            for field in DATA_FIELDS:
-                shape = field.row_shape(LETTERS)
-                dataset = create_field(group, field, shape)
-                dataset.resize(len(ids), axis=0)
-                for row, number in enumerate(ids):
-                    if field.name == "grasp_props/unused":
-                        dataset[row] = unused
-                        continue
-                    dataset[row] = (
-                        f"object {number} ü" if field.dtype == "str" else np.full(shape, number)
-                    )
-    return path
+
+    def value(field: Field, row: int) -> object:
+        if field.name == "grasp_props/unused":
+            return unused
+        return f"object {trial_ids[row]} ü" if field.dtype == "str" else trial_ids[row]
+
+    return write_data_file(path, len(trial_ids), value)
 
 
 @pytest.fixture(scope="module")
 def data_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data file with five samples to train on."""
-    return write_data_file(tmp_path_factory.mktemp("data") / "grasping_oto.hdf5", range(5))
+    return write_numbered(tmp_path_factory.mktemp("data") / "grasping_oto.hdf5", range(5))
 
 
 def test_the_working_directory_may_change(
@@ -124,7 +108,7 @@ def test_an_empty_split_names_those_with_samples(data_file: Path, split: str) ->
 
 
 def test_a_file_that_another_program_writes_names_the_remedy(tmp_path: Path) -> None:
-    path = write_data_file(tmp_path / "grasping_oto.hdf5", range(2))
+    path = write_numbered(tmp_path / "grasping_oto.hdf5", range(2))
     code = f"import h5py; file = h5py.File({str(path)!r}, 'r+'); print('open', flush=True); input()"
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
@@ -155,7 +139,7 @@ def test_other_things_are_refused(data_file: Path, tmp_path: Path) -> None:
 
 def test_grasps_of_fewer_fingers_are_read_by_who_asks_for_them(tmp_path: Path) -> None:
     """NaN does not come into training unnoticed; the other splits have none."""
-    path = write_data_file(tmp_path / "grasping_oto.hdf5", range(2), unused=0b010)
+    path = write_numbered(tmp_path / "grasping_oto.hdf5", range(2), unused=0b010)
     with pytest.raises(
         DataError,
         match=r"train must have contacts of all fingers, got 2 of 2 .*: commands need a split "
@@ -226,10 +210,10 @@ def _of_inherited() -> list[bool]:
 
 def test_a_file_with_other_samples_is_refused(tmp_path: Path) -> None:
     """A worker that opens it after it was assembled anew would give other samples, silently."""
-    path = write_data_file(tmp_path / "grasping_oto.hdf5", range(5))
+    path = write_numbered(tmp_path / "grasping_oto.hdf5", range(5))
     data = GraspDataset(path)
     path.unlink()
-    write_data_file(path, range(1, 6))
+    write_numbered(path, range(1, 6))
     with pytest.raises(DataError, match=r"must hold the samples that it held when .* opened"):
         data[0]
     path.unlink()

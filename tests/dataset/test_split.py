@@ -14,7 +14,6 @@ from drakegrasp.dataset.split import (
     SPLIT_NAMES,
     Home,
     find_homes,
-    may_train,
     split_samples,
 )
 
@@ -53,14 +52,6 @@ def test_a_named_class_trains_with_its_only_object() -> None:
     assert set(OBJECTS[trained]) == {3}
     assert len(split["valid"]) == 5
     assert set(OBJECTS[split["test"]]) == {0, 1, 2, 4, 5}
-
-
-@pytest.mark.parametrize(
-    ("named", "count", "trains"),
-    [(None, 1, False), (None, 2, True), (("a",), 1, True), (("b",), 9, False)],
-)
-def test_which_classes_train(named: tuple[str, ...] | None, count: int, trains: bool) -> None:
-    assert may_train("a", count, SplitConfig(by="class", train_classes=named)) is trains
 
 
 def test_another_class_does_not_change_a_classs_draw() -> None:

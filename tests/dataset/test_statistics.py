@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pytest
 from helpers.datasets import SLIPPED, SUCCESS, TRIALS, change, make_dataset
 
 from drakegrasp.cli.tables import approach_line, funnel_table
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.statistics import (
     count_funnel,
     count_splits,
     counts_as_dict,
 )
-from drakegrasp.dataset.trials import NONE
-from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
 from drakegrasp.outcomes import Outcome
-from drakegrasp.page.snapshot import read_snapshot
-from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 
 
 def test_words_are_counted_by_object(out: Path) -> None:
@@ -39,38 +30,6 @@ def test_words_are_counted_by_object(out: Path) -> None:
     assert funnel.precision.tolist() == [2, 3, 3]
     assert funnel.stable.tolist() == [1, 3, 3]
     assert SLIPPED not in (SUCCESS, 3)
-
-
-def test_samples_are_as_many_wherever_they_are_counted(
-    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def leave_out(*_: object) -> None:
-        raise DataError("it counts no samples")
-
-    monkeypatch.setattr("drakegrasp.pictures.figures._distributions", leave_out)
-
-    # The data file says which are samples.
-    found: Counter[str] = Counter()
-    for split in SPLITS:
-        data = GraspDataset(out / "grasping_oto.hdf5", split=split)
-        found.update(map(str, data.column("object_props/object_name")))
-    funnel = count_funnel(out)
-    assert dict(zip(funnel.names, funnel.samples.tolist(), strict=True)) == found
-    total = found.total()
-    assert sum(row.samples for row in count_splits(out)) == total
-
-    # The table, and `stats --json`.
-    columns = {column.header: column for column in funnel_table(funnel).columns}
-    last = dict(zip(columns["object"].cells, columns["samples"].cells, strict=True))
-    assert last == {**{name: str(n) for name, n in found.items()}, "all": str(total)}
-    counts = counts_as_dict(out)
-    assert {each["name"]: each["samples"] for each in counts["objects"]} == found
-
-    # The figures and the page.
-    write_figures(out, tmp_path / "figures")
-    numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())
-    assert numbers["outcomes"]["samples"] == total
-    assert np.count_nonzero(read_snapshot(out).table.split != NONE) == total
 
 
 def test_removals_are_counted_by_object(out: Path) -> None:

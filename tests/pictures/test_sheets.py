@@ -6,15 +6,14 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-import h5py
 import numpy as np
 import pytest
+from helpers.data_files import write_data_file
 from matplotlib.figure import Figure
 
 from drakegrasp.config import CameraConfig
-from drakegrasp.dataset.hdf5 import create_field
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
+from drakegrasp.dataset.schema import Field
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
@@ -30,7 +29,6 @@ from drakegrasp.vision.camera import intrinsics, project
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CAMERA = CameraConfig()
 K = intrinsics(CAMERA)
-LETTERS = sizes(fingers=3, joints=8, image=CAMERA.size)
 #: Contacts in {C}: two in front of the surface at 0.25 m, one behind it.
 P_CQ = np.array([[-0.03, -0.02, 0.24], [0.04, 0.01, 0.25], [0.0, 0.03, 0.28]])
 NHAT_Q_C = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -38,7 +36,7 @@ NHAT_Q_C = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.5])
 
 
-def write_data_file(path: Path, names: list[str], split: str = "train") -> None:
+def write_blocks(path: Path, names: list[str], split: str = "train") -> None:
     """Write a data file whose samples are all of a square block, 0.25 m before the camera."""
     image = np.full((4, CAMERA.size, CAMERA.size), 0.5, dtype=np.float32)
     mask = np.zeros((CAMERA.size, CAMERA.size), dtype=np.uint8)
@@ -52,32 +50,24 @@ def write_data_file(path: Path, names: list[str], split: str = "train") -> None:
         "object_props/frame_work2cam_oto": pack_pose(X_TC),
         "object_props/frame_work2cam_otm": pack_pose(X_TC),
     }
-    with h5py.File(path, "w") as file:
-        file.attrs.update(schema_version=SCHEMA_VERSION, K=K, near=CAMERA.near, far=CAMERA.far)
-        file.attrs.update(seed=0, config="{}", versions="{}", camera="oto", fingers="{}")
-        file.attrs["joints"], file.attrs["split_by"] = "[]", "object"
-        file.attrs.update(signature="of a test", shards="of a test", config_hash="of a test")
-        for name in SPLITS:
-            group, rows = file.create_group(name), len(names) if name == split else 0
-            for field in DATA_FIELDS:
-                dataset = create_field(group, field, field.row_shape(LETTERS))
-                dataset.resize(rows, axis=0)
-                if rows and field.dtype == "str":
-                    dataset[:] = names
-                elif rows and field.name == "trial_id":
-                    dataset[:] = 10 + np.arange(rows)
-                elif rows:
-                    dataset[:] = values.get(field.name, 0.0)
+
+    def value(field: Field, row: int) -> object:
+        if field.name == "trial_id":
+            return 10 + row
+        return names[row] if field.dtype == "str" else values.get(field.name, 0.0)
+
+    camera = {"K": K, "near": CAMERA.near, "far": CAMERA.far}
+    write_data_file(path, len(names), value, split=split, image=CAMERA.size, **camera)
 
 
 def test_the_sheet_of_a_dataset_has_all_objects(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "grasping_oto.hdf5"
-    write_data_file(path, [])
+    write_blocks(path, [])
     with pytest.raises(DataError, match="at least one sample"):
         sample_sheet(path)
-    write_data_file(path, ["1_mug_small", "1_mug_small", "2_box"], split="test")
+    write_blocks(path, ["1_mug_small", "1_mug_small", "2_box"], split="test")
     figure, trials = sample_sheet(path)
     assert trials == [10, 11, 12]
     assert notes(figure) == "3 of 3 samples, 2 of 2 objects with samples"
@@ -90,7 +80,7 @@ def test_the_sheet_of_a_dataset_has_all_objects(
         (5, [10, 11, 12, 13, 14], "5 of 10 samples, 5 of 5 objects with samples"),
         (9, [10, 12, 13, 15, 16, 18], "6 of 10 samples, 6 of 9 objects with samples"),
     ):
-        write_data_file(path, [f"{1 + i % objects}_box" for i in range(10)])
+        write_blocks(path, [f"{1 + i % objects}_box" for i in range(10)])
         figure, trials = sample_sheet(path)
         assert trials == drawn
         assert notes(figure) == note
@@ -102,7 +92,7 @@ def notes(figure: Figure) -> str:
 
 def test_dots_are_where_the_contacts_project(tmp_path: Path) -> None:
     path = tmp_path / "grasping_oto.hdf5"
-    write_data_file(path, ["1_mug"])
+    write_blocks(path, ["1_mug"])
     data = GraspDataset(path)
     figure = draw_sheet([data[0]], data.K, far=CAMERA.far)
     expected = project(K, P_CQ)
@@ -130,7 +120,7 @@ def test_examples_of_the_docs_run(
 ) -> None:
     text = (DOCS / "reference" / "frames-and-units.md").read_text(encoding="utf-8")
     (tmp_path / "OUT").mkdir()
-    write_data_file(tmp_path / "OUT" / "grasping_oto.hdf5", ["1_mug"])
+    write_blocks(tmp_path / "OUT" / "grasping_oto.hdf5", ["1_mug"])
     monkeypatch.chdir(tmp_path)
     space: dict[str, Array] = {}
     for block in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
