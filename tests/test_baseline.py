@@ -8,10 +8,8 @@ import os
 import subprocess
 import sys
 import threading
-from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -34,14 +32,13 @@ from batches import centred, object_points, turned
 from fitting import ahead
 from networks import (
     ContactNetwork,
-    GraspClassifier,
     HandCoordinates,
     PostureNetwork,
     PostureSize,
     farthest_points,
     orthonormal,
 )
-from predict import predict_postures, proposals
+from predict import proposals
 from train import temperature
 
 BASELINE = Path(__file__).resolve().parents[1] / "pipelines" / "baseline"
@@ -120,47 +117,6 @@ def test_proposals_are_ranked_and_differ() -> None:
     gaps = torch.cdist(X_TG[:, :3, 3], X_TG[:, :3, 3]) + torch.eye(4)
     turned_by = (X_TG[:, None, :3, :3] * X_TG[None, :, :3, :3]).sum((-1, -2)) < 1 + 2 * 0.9659
     assert ((gaps > 0.01) | turned_by).all()
-
-
-class OneView:
-    """Scenes of one view."""
-
-    names, joints, views = ("box",), ("a", "b", "c"), (0,)
-
-    def __init__(self) -> None:
-        self.tables = {"views": {"scene": [0]}, "scenes": {"resting": np.zeros((1, 1), dtype=int)}}
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        points = made_up()["points"][0].numpy()
-        seen = {"points": points, "on_object": np.ones(len(points), dtype=bool)}
-        return seen | {"X_AO": np.eye(4), "object": 0, "scene": 0}
-
-
-def test_a_judge_chooses_from_the_proposals_that_compete(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One that likes the least likely proposal the best has that of eight."""
-    monkeypatch.setattr(predict, "POOL", 8)
-    torch.manual_seed(0)
-    hand = HandCoordinates(torch.zeros(3), torch.eye(3)[:2], torch.zeros(3)).as_dict()
-    weights = [each.state_dict() for each in (PostureNetwork(SMALL), GraspClassifier(2))]
-    judge = {"task": "classifier", "hand": hand, "weights": weights[1]}
-    torch.save(judge, tmp_path / "judge.pt")
-    order = lambda _, cloud, *rest: torch.arange(float(len(cloud)))[:, None].expand(-1, 2)  # noqa: E731
-    monkeypatch.setattr(GraspClassifier, "forward", order)
-    monkeypatch.setattr(predict.dg, "SceneDataset", lambda *_, **__: OneView())
-    arguments = Namespace(
-        data=tmp_path / "scenes.hdf5",
-        split="test",
-        judge=tmp_path / "judge.pt",
-        choose="chance",
-        proposals=1,
-        views=None,
-    )
-    checkpoint = {"size": vars(SMALL), "hand": hand, "weights": weights[0]}
-    with torch.no_grad():
-        found = predict_postures(checkpoint, arguments)
-    assert found["confidence"] == pytest.approx(torch.tensor([7.0]).sigmoid().numpy())
 
 
 def test_closing_ranks_a_networks_proposals_with_grasps_from_above() -> None:

@@ -29,7 +29,6 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import MachineError
 from drakegrasp.generation.pipeline import Counts
-from drakegrasp.generation.target import Target
 from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
@@ -60,44 +59,24 @@ def out(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "out"))
 
 
-def _cut_shard(out: Path) -> None:
-    path = sorted(out.glob("shards/*/*.h5"))[-1]
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def _nothing(out: Path) -> None:
-    pass
-
-
 @pytest.mark.parametrize(
-    ("spoil", "arguments", "words"),
+    ("arguments", "words"),
     [
+        (["--reject", "reject.json"], "must be a list of rejections of drakegrasp inspect"),
+        (["--set", "filters.max_slip=-1"], "must be greater than 0"),
         (
-            _nothing,
-            ["--reject", "reject.json"],
-            "must be a list of rejections of drakegrasp inspect",
-        ),
-        (_cut_shard, [], "damaged or cut off"),
-        (_nothing, ["--set", "filters.max_slip=-1"], "must be greater than 0"),
-        (
-            _nothing,
             ["--set", "lift.hold_time=9"],
             "filters, split, verify can change, got one that changes what was simulated",
         ),
     ],
-    ids=["reject", "shard", "value", "key"],
+    ids=["reject", "value", "key"],
 )
 def test_refused_assemble_changes_nothing(
-    out: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    spoil: Callable[[Path], None],
-    arguments: list[str],
-    words: str,
+    out: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str
 ) -> None:
     """Neither the files nor the filters that the next build would use."""
     monkeypatch.chdir(out.parent)
     Path("reject.json").write_text("[]")
-    spoil(out)
     before = state(out)
     result = run("assemble", out, *SLIPPED, *arguments)
     assert result.exit_code in (1, 2)
@@ -207,17 +186,6 @@ def test_files_are_of_one_state_or_told_whenever_assembling_is_killed(
     assert sorted(os.listdir(out)) == sorted(whole)
 
 
-def test_files_of_two_states_are_a_finding(out: Path) -> None:
-    old = (out / OTM).read_bytes()
-    assert run("assemble", out, *SLIPPED).exit_code == 0
-    assert read_manifest(out).config.filters.max_slip == SLIP / 2
-    assert run("check", out).exit_code == 0
-    (out / OTM).write_bytes(old)
-    result = run("check", out)
-    assert result.exit_code == 1
-    assert f"{OTM}: attribute signature must be that of manifest.json" in result.stdout
-
-
 def _crash(*arguments: object) -> TrialRecord:
     setup, attempt = arguments[:2]
     return TrialRecord(
@@ -249,34 +217,6 @@ def test_few_crashes_are_no_error(whole: Path) -> None:
         outcomes = {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed}
         counts.add(UnitSummary(header=header, outcomes=outcomes, errors={}))
         assert len(counts.unexplained()) == said
-
-
-def test_bar_counts_the_samples_of_a_target(whole: Path) -> None:
-    """Their number is due from when each object has been tried."""
-    manifest, shown = read_manifest(whole), list[tuple[int, int | None, dict[str, int]]]()
-    config = manifest.config.model_copy(update={"samples": 4})
-    target = Target(config, {entry.name: 0 for entry in manifest.objects})
-    counts = Counts(
-        manifest,
-        target,
-        None,
-        lambda done, total, **figures: shown.append((done, total, figures)),
-    )
-    by_object = {
-        entry.name: [unit for unit in manifest.headers() if unit.object_name == entry.name]
-        for entry in manifest.objects
-    }
-    for name, units in by_object.items():
-        target.set_units(name, units, endless=True)
-    for unit in (units[0] for units in by_object.values()):
-        target.add(unit, [unit.start])
-        outcomes = {Outcome.SUCCESS: 2, Outcome.RAY_MISS: 1}
-        counts.add(UnitSummary(header=unit, outcomes=outcomes, errors={}))
-    assert shown == [
-        (1, None, {"attempts": 3, "grasps": 2}),
-        (2, None, {"attempts": 6, "grasps": 4}),
-        (3, 4, {"attempts": 9, "grasps": 6}),
-    ]
 
 
 def test_build_connects_with_the_certificates_that_it_is_given(

@@ -2,23 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
 from helpers.scripts import load_script
-
-#: Cases that a run of the tests tries; the script tries more.
-SEED = 7
-CASES = {"dataset": 8, "meshes": 12, "hands": 8}
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.timeout(500)
-@pytest.mark.parametrize("kind", CASES)
-def test_spoilt_files_are_read_with_equal_values_or_refused_in_a_line(kind: str, out: Path) -> None:
-    fuzz = load_script("measurements/fuzz").fuzz
-    assert list(fuzz(out if kind == "dataset" else kind, CASES[kind], SEED)) == []
 
 
 def test_other_values_need_a_line() -> None:

@@ -174,14 +174,6 @@ def test_grasps_of_scenes_become_a_dataset(
         assert len(outcomes) == len(postures["row"]) and Outcome.SUCCESS in outcomes
 
 
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_workers_change_nothing(scenes: Path, predicted: Path, tmp_path: Path) -> None:
-    result = run("predict", scenes, "--out", tmp_path / "by 2.h5", *FEW, "--workers", 2)
-    assert result.exit_code == 0, result.output
-    assert (tmp_path / "by 2.h5").read_bytes() == predicted.read_bytes()
-
-
 def test_a_cloud_may_be_in_any_unit(cloud: Path, own: GraspTable, tmp_path: Path) -> None:
     points, path, out = np.load(cloud), tmp_path / "cloud.ply", tmp_path / "grasps.h5"
     lines = "\n".join(" ".join(f"{1e3 * x:.6f}" for x in point) for point in points)

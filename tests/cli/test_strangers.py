@@ -214,23 +214,3 @@ def test_paths_and_names_of_files_do_not_steer_the_terminal(tmp_path: Path) -> N
 def test_names_on_a_page_steer_nothing() -> None:
     page = TEMPLATES.from_string("<p>{{ name }}</p>").render(name=f"<é{STEERING}>")
     assert page == "<p>&lt;é\\x1b]0;x\\x07\\x9b31m&gt;</p>"
-
-
-#: Nine lists of nine: a billion values in a few lines.
-BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
-)
-
-
-@pytest.mark.parametrize("text", [BOMB, "a: &a [*a]\n", "[" * 5000])
-def test_yaml_that_grows_is_refused(tmp_path: Path, text: str) -> None:
-    meshes, bomb = tmp_path / "meshes", tmp_path / "bomb.yaml"
-    meshes.mkdir()
-    trimesh.creation.box([0.1, 0.1, 0.1]).export(meshes / "1_box.stl")
-    bomb.write_text(text)
-    words = "nested too deeply" if text.startswith("[") else "aliases that stand for more than"
-    build = ["build", "--out", tmp_path / "out", "--objects", meshes]
-    assert words in refusal(*build, "--config", bomb)
-    assert words in run("hand", "check", bomb).output
-    assert words in refusal(*build, "--manifest", bomb)
-    assert not (tmp_path / "out").exists()

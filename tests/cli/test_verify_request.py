@@ -38,25 +38,6 @@ def placed(out: Path, grasps: Path | None = None, **options: Any) -> Any:
     return place(grasps or out / OTO, Target(**options))
 
 
-@pytest.mark.parametrize("overrides", [(), ("verify.max_tries=1",)])
-def test_rows_are_tried_with_their_own_friction_and_mass(
-    drawn: Path, overrides: tuple[str, ...]
-) -> None:
-    data = GraspDataset(drawn / OTO, split="test")
-    grasps, config, _ = placed(drawn, overrides=overrides)
-    assert len(grasps) == len(data) > 0
-    for grasp in grasps:
-        row = data[grasp.index]
-        assert grasp.placed.model.mass == pytest.approx(float(row.props["work2mass"][0]))
-        for name in ("friction_hand", "friction_table"):
-            assert getattr(grasp.config.physics, name) == pytest.approx(float(row.conditions[name]))
-        assert grasp.config.verify.max_tries == config.verify.max_tries
-    # The configuration of all is none of the rows'.
-    known = read_manifest(drawn).config
-    assert config.physics == known.physics
-    assert config.verify.max_tries == (1 if overrides else known.verify.max_tries)
-
-
 def test_a_value_that_is_set_wins_over_the_drawn_one(drawn: Path) -> None:
     data = GraspDataset(drawn / OTO, split="test")
     grasps, _, _ = placed(drawn, overrides=("physics.friction_hand=0.9",))

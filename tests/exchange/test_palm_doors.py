@@ -12,12 +12,9 @@ import yaml
 from helpers.commands import run
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
-from drakegrasp.scoring.verdict import rank_file
 
 #: A box in centimetres, away from the origin of its file, and where its middle is [m].
 EDGES, MIDDLE = np.array([4.0, 9.0, 3.6]), np.array([0.03, -0.02, 0.05])
@@ -61,24 +58,6 @@ def test_graspgen_is_verified_on_a_mesh_in_centimetres(tmp_path, monkeypatch):
     # As if it were the palm link's, the fingers close along the long edges, which are too far.
     done = run("verify", "box.yaml", *FRANKA, "--workers", "1")
     assert not any(json.loads(line)["matches"] for line in done.stdout.splitlines())
-
-
-def test_grasps_of_an_object_are_for_each_of_its_rows_and_ranked(out, tmp_path):
-    data = GraspDataset(out / "grasping_oto.hdf5", split="test")
-    names = data.column("object_props/object_name")
-    name = str(names[0])
-    folder = tmp_path / "grasps"
-    folder.mkdir()
-    write_graspgen(folder / f"{name}.yaml", [X_MA, X_MA], [0.2, 0.7])
-    write_graspgen(folder / "unknown.yaml", [X_MA], [0.5])
-    table = rank_file(folder, data, {"frame": "object", "link": "base"})
-    rows = np.flatnonzero(names == name)
-    np.testing.assert_array_equal(table.of_row, np.repeat(rows, 2))
-    np.testing.assert_array_equal(table.confidence, np.tile([0.7, 0.2], len(rows)))
-    assert table.frame == "object" and set(table.invalid) == {""}
-    assert table.left_out == "grasps are left out, as the split has no row of unknown"
-    with pytest.raises(GraspError, match="link must be 'palm'"):
-        rank_file(folder, data, {"link": "dexgraspbench"})
 
 
 def test_the_caller_says_the_preshape_of_rows_that_name_none(tmp_path):

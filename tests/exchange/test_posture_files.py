@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -279,10 +277,8 @@ def test_isaac_grasp_says_of_which_object_and_gripper_it_is(tmp_path):
     ("gripper", "own"),
     [
         ("bots/allegro_hand_right.usd", True),
-        ("WonikAllegro.usd", True),
         ("bots/franka_panda.usd", False),
         ("single_suction_cup_30mm.usd", False),
-        ("hand.usd", False),
     ],
 )
 def test_grasps_of_another_gripper_are_refused_unless_their_frame_is_named(tmp_path, gripper, own):
@@ -404,36 +400,6 @@ def test_grasp_of_isaac_grasp_that_is_none_is_a_row_of_its_own(tmp_path):
 # Refusals
 
 
-class Evil:
-    """Runs a command where it is unpickled without care."""
-
-    def __init__(self, mark: Path) -> None:
-        self.mark = mark
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, (str(self.mark),)
-
-
-def write_pickle(path: Path, content: Any, protocol: int) -> Path:
-    """As `write_dictionary`, by any protocol."""
-    array = np.empty((), dtype=object)
-    array[()] = content
-    head = {"descr": "|O", "fortran_order": False, "shape": ()}
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, head)
-        pickle.dump(array, file, protocol=protocol)
-    return path
-
-
-@pytest.mark.parametrize("protocol", [3, 4])
-def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
-    evil = dexgraspbench(obj_scale=Evil(tmp_path / "ran"))
-    path = write_pickle(tmp_path / "0.npy", evil, protocol)
-    with pytest.raises(GraspError, match=r"got \w+\.mkdir; nothing of it was run"):
-        read_attempts(path, HAND)
-    assert not (tmp_path / "ran").exists()
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -446,23 +412,13 @@ def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
         ({"poses": POSES}, r"some of .*X_FG.*, got 'poses' of shape \(2, 4, 4\); contact points"),
         ({"X_FG": POSES + 0.5j}, "X_FG must be poses, .*, got complex numbers"),
         ({"q_grasp": GRASP + 1j}, "grasp joints must be numbers .*, got complex numbers"),
-        ({"resting": np.array([0, 1j])}, "resting must be numbers .*, got complex numbers"),
         ({"mass": np.array([0.1, 1j])}, "mass must be 2 numbers each, got complex numbers"),
         ({"mass": np.array([0.1])}, "mass must be 2 numbers each, got other shapes"),
-        ({"confidence": np.array([0.1, 1j])}, "confidence must .*, got complex numbers"),
         ({"q_grasp": GRASP.astype(str)}, "grasp joints must be numbers .*, got text"),
         ({"quaternion": np.eye(4)[:2]}, "poses must be X_FG, or position and .*, got both"),
         ({"object": np.zeros(2)}, "object must be texts"),
         ({"frame": ["table", ""]}, "frame must be the same in all rows"),
         ({"X_FG": None}, r"X_FG \(or position and .* must"),
-        (
-            {
-                "X_FG": None,
-                "position": np.zeros((2, 3)),
-                "quaternion": [[1, 0, 0, 0], [1, 0, 0, 1j]],
-            },
-            r"position and quaternion must .*, got complex",
-        ),
     ],
 )
 def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, words):

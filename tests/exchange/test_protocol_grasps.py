@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 from helpers.commands import error_line, run
@@ -76,21 +75,6 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
     assert held["success"] and held["file"].endswith("own.npz")
     assert none["reason"].startswith("invalid: the palm's pose must have 0 0 0 1")
     assert lost["reason"] == "moved"
-
-    # The same by the lift in Drake, in files.
-    given = ("verify", tmp_path / "own.npz", "--object", mesh, "--workers", 1)
-    result = run(*given, "--out", tmp_path / "lift.h5", "--json")
-    assert result.exit_code == 0, result.output
-    held, none, lost = map(json.loads, result.stdout.splitlines())
-    assert held["lifted"] and held["matches"] and held["fit_residual"] is None
-    np.testing.assert_allclose(held["closed_q"], end.q, atol=1e-3)
-    np.testing.assert_allclose(held["X_OG"], np.asarray(record.X_OG), atol=1e-5)
-    assert none["outcome"] == "invalid"
-    assert none["reason"].startswith("the palm's pose must have 0 0 0 1")
-    assert lost["outcome"] == "screened"  # by geometry, as a build does
-    assert lost["reason"].startswith("geometry shows that not every fingertip")
-    with h5py.File(tmp_path / "lift.h5") as file:
-        assert file["grasps/matches"][:].tolist() == [True, False, False]
 
     grasp = pack_grasp(end.contacts.p_OQ, end.contacts.nhat_Q_O)
     np.save(tmp_path / "18.npy", np.array([np.full(18, np.nan), grasp]))
@@ -202,14 +186,6 @@ def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_
     assert told == [(0, 2), (1, 2), (2, 2)] and sent == [2, 2]
     made = sorted(path.name for path in (tmp_path / "to" / OBJECTS).iterdir())
     assert made == sorted(model.name for model in models[:2])
-
-
-def test_postures_name_no_object_without_a_mesh_or_a_dataset(tmp_path: Path) -> None:
-    np.savez(tmp_path / "own.npz", object=np.array(["a"]))
-    result = run("verify", tmp_path / "own.npz", "--protocol", "dexgraspbench")
-    assert result.exit_code == 2
-    why = "--object MESH or --dataset FILE must be given where the grasps are not in"
-    assert why in error_line(result)
 
 
 def test_score_by_a_protocol_says_so_on_the_card(

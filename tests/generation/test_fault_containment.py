@@ -23,7 +23,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.generation import attempts
-from drakegrasp.generation.work_unit import WorkUnit, run_unit
+from drakegrasp.generation.work_unit import STAGE_SECONDS, WorkUnit, run_unit
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import host_label
@@ -106,30 +106,6 @@ def test_random_kills_change_nothing(meshes: Path, tmp_path: Path) -> None:
     assert_clean(out)
 
 
-@pytest.mark.nightly
-@pytest.mark.cluster
-def test_client_that_is_stopped_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """One that is killed: test_interruptions.py."""
-    out = tmp_path / "out"
-    begin(out, undisturbed, units=6)
-    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
-        before = len(list(out.glob("shards/*/*.h5")))
-        process = start_build(meshes, out, workers=2)
-        while len(list(out.glob("shards/*/*.h5"))) == before:
-            assert process.poll() is None
-            time.sleep(0.05)
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
-        assert process.returncode == code
-        assert errors.splitlines()[-1] == "stopped; the same command continues from here"
-        assert "Traceback" not in errors
-        assert not (out / "build.lock").exists()
-    said, _ = finish(start_build(meshes, out, workers=2))
-    assert "had been done before" in said
-    assert_same_dataset(undisturbed, out)
-    assert_clean(out)
-
-
 def test_objects_are_prepared_once_whatever_died(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,6 +180,20 @@ def test_every_step_of_a_unit_is_in_its_journal(
     config = read_manifest(out).config
     with pytest.raises(MachineError, match=r"1_box_a: .*passed its time limit"):
         run_unit(WorkUnit(out=out, header=header, config=config, restartable=True))
+
+
+def test_every_step_of_a_unit_has_a_limit(
+    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    header = next(read_manifest(out).headers())
+    header.path(out).unlink()
+    step, config = Mock(wraps=Journal.step), read_manifest(out).config
+    monkeypatch.setattr(Journal, "step", lambda *given: step(*given))
+    run_unit(WorkUnit(out=out, header=header, config=config, restartable=True))
+    limits = {name: seconds for _, name, seconds in (call.args for call in step.call_args_list)}
+    assert {"build", "screen", "measure", "write"} < limits.keys()
+    assert 0.0 < min(limits.values()) <= max(limits.values()) == STAGE_SECONDS
 
 
 # Faults found on start

@@ -9,13 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
-import numpy as np
 import pytest
 from helpers import datasets
 from helpers.assertions import assert_same_arrays
-from helpers.builds import build
 from helpers.datasets import BOTH, BOXES, TRIALS, edit_manifest, make_dataset
-from helpers.meshes import write_fixed
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.check import check_dataset
@@ -23,11 +20,8 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.errors import DataError
 from drakegrasp.generation.merge import merge
-from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.file_format import MODELS
-from drakegrasp.hand.settings import load_config, override_config
-from drakegrasp.objects.sources import find_meshes
-from drakegrasp.outcomes import Outcome
+from drakegrasp.hand.settings import override_config
 from drakegrasp.page.snapshot import read_snapshot
 from drakegrasp.runtime.files import seal
 
@@ -181,35 +175,3 @@ def test_what_differs_is_named_and_refused(
 def test_a_directory_in_use_is_refused(sound: Path, out: Path) -> None:
     with pytest.raises(DataError, match="must be a new or empty directory"):
         merge(out, [sound])
-
-
-@pytest.mark.nightly
-@pytest.mark.sim
-@pytest.mark.slow
-def test_merged_builds_replay_bit_equal(tmp_path: Path) -> None:
-    """Everything is drawn: palm poses, resting poses and conditions."""
-    write_fixed(tmp_path / "meshes", "8_wineglass_flute", "10_box_tall")
-    sources = find_meshes(tmp_path / "meshes")
-    drawn = [
-        *("candidates.max=8", "unit_candidates=4", "candidates.method=[normals, rotations]"),
-        *("objects.resting_poses=2", "filters.outlier_sigma=0", "filters.require=lifted"),
-        "physics.friction_hand=1.5",
-    ]
-    config = load_config("randomized", overrides=drawn)
-    outs = [tmp_path / "first", tmp_path / "second"]
-    for out, own in zip(outs, (sources[:1], sources[1:]), strict=True):
-        build(own, out, config)
-    build(sources, tmp_path / "whole", config)
-
-    # Halves by objects are the whole, may be built on, and replay.
-    merge(tmp_path / "halves", outs)
-    assert_same_arrays(tmp_path / "halves" / TRIALS, tmp_path / "whole" / TRIALS)
-    report = build(sources, tmp_path / "halves", config)
-    assert (report.simulated, report.assembled) == (0, False)
-    with h5py.File(tmp_path / "halves" / TRIALS) as file:
-        owner, outcome = (file["trials"][key][:] for key in ("object", "outcome"))
-    for number in range(2):
-        lifted = np.flatnonzero((owner == number) & (outcome == Outcome.SUCCESS))
-        for row in (*np.flatnonzero(owner == number)[:2], *lifted[:1]):
-            again = replay_trial(tmp_path / "halves", int(row))
-            assert again.same, (number, row, again.differences)

@@ -18,7 +18,6 @@ from drakegrasp.api.building import known_work
 from drakegrasp.config import Config
 from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.schema import NO_PRESHAPE
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
@@ -110,13 +109,6 @@ def test_each_row_is_an_attempt_with_its_outcome(dataset):
 @pytest.mark.parametrize("row", range(4))
 def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
     assert replay_trial(dataset, row).same
-
-
-def test_plan_keeps_what_the_file_said(dataset, table):
-    config = build_config(CONFIG, table)
-    kept = load_prepared(dataset, NAME, config).candidates.postures
-    np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
-    assert kept.preshape.tolist() == [""] * 4
 
 
 @pytest.mark.nightly

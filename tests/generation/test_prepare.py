@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import trimesh
 
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
-from drakegrasp.generation.prepare import DrawTask, PrepareTask, prepare_one
+from drakegrasp.generation.prepare import PREPARE_SECONDS, DrawTask, PrepareTask, prepare_one
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes, source_sha256
+from drakegrasp.runtime.journal import Journal, Verdict
 
 pytestmark = pytest.mark.sim
 
@@ -60,3 +63,28 @@ def test_files_of_the_object_travel_to_who_draws_more_palms(task: PrepareTask) -
     prepare_one(task)
     more = DrawTask(out=task.out, name="1_box", config=task.config, count=9)
     assert set(more.reads()) >= {"objects/1_box.npz", "objects/1_box.plan.h5"}
+
+
+@pytest.mark.parametrize(
+    ("verdict", "reason", "again"),
+    [
+        (Verdict.HUNG, "preparing it passed its time limit", False),
+        (Verdict.VANISHED, "preparing it was at work whenever its process vanished", True),
+    ],
+)
+def test_mesh_that_killed_its_process_is_refused(
+    task: PrepareTask, monkeypatch: pytest.MonkeyPatch, verdict: Verdict, reason: str, again: bool
+) -> None:
+    """The next build may have more memory, but no more time."""
+    monkeypatch.setattr(Journal, "verdict", lambda *_: verdict)
+    _, entry = prepare_one(replace(task, restartable=True))
+    assert isinstance(entry, RefusedMesh)
+    assert entry.reason.startswith(reason) and entry.again is again
+
+
+def test_preparing_has_a_limit(task: PrepareTask, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a limit does: test_journal.py."""
+    step = Mock(wraps=Journal.step)
+    monkeypatch.setattr(Journal, "step", lambda *given: step(*given))
+    prepare_one(replace(task, restartable=True))
+    assert [call.args[1:] for call in step.call_args_list] == [("prepare", PREPARE_SECONDS)]

@@ -21,11 +21,12 @@ from threadpoolctl import threadpool_info
 
 from drakegrasp.config import BuiltinConfig, SplitConfig
 from drakegrasp.dataset.split import find_homes, split_samples
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import make_pose, transform_points
 from drakegrasp.generation.prepare import prepare
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.scoring.predicting import propose
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.attempt import (
@@ -109,6 +110,8 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     X_TO = make_pose(R_TO, [0.1, 0.2, model.half_extents[2]])
     closing = Drawing(model, X_TO, load_config("fast")).candidates(CLOSING)
     yield "closing", digest(closing.X_OG, closing.spread)
+    cloud = transform_points(X_TO, model.visual_vertices)
+    yield "proposals", digest(propose(cloud, hand).X_FG)
     screenings = screen(model, hand, rest, attempts[:PREDICTED], config.screen)
     yield (
         "predictions",

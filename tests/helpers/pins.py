@@ -1,14 +1,13 @@
 """Pin what a rebuilt house may not change: arrays of builds, scenes, verdicts, scores, objects.
 
 The script runs commands on a few palm poses of built-in objects in a temporary folder and names
-every array that comes out. On one machine all are equal to the bit:
+every array that comes out:
 
-    python tests/helpers/pins.py FILE --update      writes their hashes
-    python tests/helpers/pins.py FILE               compares with them, and names what differs
+    python tests/helpers/pins.py [--few] FILE       writes them
 
-`tests/test_pins.py` compares on any machine, see docs/explanation/determinism.md, with
-`tests/helpers/pins.npz`, which `--values` writes, and on every change a few of them
-with `tests/helpers/few_pins.npz`, which `--few` writes.
+`tests/test_pins.py` compares them on any machine, see docs/explanation/determinism.md, with
+`tests/helpers/pins.npz`, and on every change a few of them, of one work unit, with
+`tests/helpers/few_pins.npz`.
 """
 
 from __future__ import annotations
@@ -245,12 +244,6 @@ def calls(out: Path, split: str) -> Pins:
     return found | {f"calls/posture/{k}": np.asarray(v) for k, v in told.items()}
 
 
-def digest(value: np.ndarray) -> str:
-    """Return the hash of type, shape and bytes."""
-    head = f"{value.dtype.kind}{value.dtype.itemsize} {value.shape} "
-    return hashlib.sha256(head.encode() + np.ascontiguousarray(value).tobytes()).hexdigest()
-
-
 def differences(found: dict[str, str], expected: dict[str, str]) -> list[str]:
     """Return a line for each name that differs or is gone; what is new has changed nothing."""
     lines = [f"gone: {name}" for name in expected.keys() - found.keys()]
@@ -303,32 +296,12 @@ def far(found: Pins, expected: Pins) -> list[str]:
     return differences(ours, marks)
 
 
-def main() -> int:
-    """Run the script; return its exit code."""
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("hashes", type=Path, help="file of the hashes (.json)")
-    parser.add_argument("--few", type=Path, help="write the values of a few pins (.npz), no others")
-    parser.add_argument("--update", action="store_true", help="write it, and do not compare")
-    parser.add_argument("--values", type=Path, help="write what other machines compare with (.npz)")
-    parser.add_argument("--keep", type=Path, help="empty folder for what is made  [default: none]")
+    parser.add_argument("values", type=Path, help="file to write (.npz)")
+    parser.add_argument("--few", action="store_true", help="write a few pins, no others")
     arguments = parser.parse_args()
-    with TemporaryDirectory() as folder:
-        if arguments.few:
-            write_values(arguments.few, few(Path(folder)))
-            return 0
-        found = everything(arguments.keep or Path(folder))
-    hashes = {name: digest(value) for name, value in sorted(found.items())}
-    if arguments.values:
-        write_values(arguments.values, found)
-    if arguments.update:
-        arguments.hashes.write_text(json.dumps(hashes, indent=1) + "\n")
-        return 0
-    lines = differences(hashes, json.loads(arguments.hashes.read_text()))
-    print(*lines, f"{len(hashes)} pins, {len(lines)} differ", sep="\n")  # noqa: T201
-    return bool(lines)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    with TemporaryDirectory() as name:
+        write_values(arguments.values, (few if arguments.few else everything)(Path(name)))

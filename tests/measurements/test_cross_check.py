@@ -9,10 +9,9 @@ import h5py
 import pytest
 from click.testing import CliRunner
 from cross_check import GROUPS, agreement, draw_lifts, main
-from helpers.datasets import AFTER_LIFT, BOXES, OUTCOMES, SLIPPED, TRIALS, change, make_dataset
+from helpers.datasets import BOXES, SLIPPED, TRIALS, change, make_dataset
 from scipy.stats import binomtest
 
-from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome
 
@@ -58,12 +57,6 @@ def test_drawn_lifts_have_their_own_friction_and_mass(tmp_path):
     assert len({lift.materials for lift in lifts}) == len(lifts)
 
 
-def test_hand_on_the_table_after_closing_is_no_lift(dataset):
-    drawn = {lift.trial_id for lift in draw_lifts(dataset, 1000)}
-    on_table = [i for i, outcome in enumerate(OUTCOMES) if outcome is Outcome.TABLE_CONTACT]
-    assert drawn & set(on_table) == {AFTER_LIFT}
-
-
 def test_lift_without_a_verdict_is_no_lost_one(dataset, tmp_path):
     out = make_dataset(tmp_path / "data", tmp_path)
     change(out, TRIALS, "trials/outcome", SLIPPED, lambda _: Outcome.MOVED)
@@ -83,37 +76,6 @@ def test_groups_and_objects_take_turns(dataset, tmp_path):
     with h5py.File(out / TRIALS, "r+") as file:
         file["successes/removal"][:] = Removal.OUTLIER
     assert Counter(lift.group for lift in draw_lifts(out, 9)) == {"removed": 5, "lost": 4}
-
-
-def test_draw_depends_on_the_seed_alone(dataset, tmp_path):
-    def drawn(out):
-        return [lift.trial_id for lift in draw_lifts(out, 8)]
-
-    assert drawn(dataset) == drawn(dataset)
-    other = make_dataset(tmp_path / "data", tmp_path, overrides=["seed=5"])
-    assert drawn(other) != drawn(dataset)
-
-
-def test_fewer_lifts_are_the_first_of_more(dataset):
-    few, more = ([lift.trial_id for lift in draw_lifts(dataset, n)] for n in (5, 11))
-    assert more[:5] == few
-
-
-def test_dataset_without_lifts_is_refused(dataset, tmp_path):
-    out = make_dataset(tmp_path / "data", tmp_path)
-    with h5py.File(out / TRIALS, "r+") as file:
-        file["trials/outcome"][:] = Outcome.RAY_MISS
-    with pytest.raises(DataError, match="got one in which no lift was tried"):
-        draw_lifts(out, 5)
-
-
-def test_dataset_without_trials_is_refused(dataset, tmp_path):
-    out = make_dataset(tmp_path / "data", tmp_path)
-    (out / TRIALS).unlink()
-    with pytest.raises(DataError, match=r"trials.hdf5: must be the trials of a dataset, got none"):
-        draw_lifts(out, 5)
-    with pytest.raises(DataError, match="must be the directory of a dataset"):
-        draw_lifts(tmp_path / "nothing", 5)
 
 
 def test_agreement_counts_what_is_lifted_there():

@@ -16,8 +16,8 @@ from helpers.mesh_files import (
     READ,
     REFUSED,
     dae,
-    edited_glb,
     load_mesh,
+    nodes_glb,
     obj,
     ply,
     prism,
@@ -247,7 +247,7 @@ def test_node_is_scaled_then_turned_then_moved(tmp_path):
         [4.0, 5.0, 6.0],
     )
     pose = {"rotation": turn.as_quat().tolist(), "scale": scale, "translation": place}
-    mesh = load_mesh(write_file(tmp_path, "a.glb", edited_glb(lambda _: [{"mesh": 0, **pose}])))
+    mesh = load_mesh(write_file(tmp_path, "a.glb", nodes_glb({"mesh": 0, **pose})))
     wanted = turn.apply(CUBE * scale) + place
     found = [np.linalg.norm(mesh.vertices - corner, axis=1).min() for corner in wanted]
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
@@ -258,11 +258,9 @@ def test_child_is_moved_in_the_axes_of_its_parent(tmp_path):
     parent = {"rotation": turn.as_quat().tolist(), "translation": [4.0, 5.0, 6.0]}
     child = {"mesh": 0, "translation": [1.0, 2.0, 3.0]}
 
-    def edit(g):
-        g.extra.update(scene=0, scenes=[{"nodes": [0]}])
-        return [{"children": [1], **parent}, child]
-
-    mesh = load_mesh(write_file(tmp_path, "a.glb", edited_glb(edit)))
+    nodes = ({"children": [1], **parent}, child)
+    content = nodes_glb(*nodes, scene=0, scenes=[{"nodes": [0]}])
+    mesh = load_mesh(write_file(tmp_path, "a.glb", content))
     wanted = turn.apply(CUBE + np.array([1.0, 2.0, 3.0])) + np.array([4.0, 5.0, 6.0])
     found = [np.linalg.norm(mesh.vertices - corner, axis=1).min() for corner in wanted]
     np.testing.assert_allclose(found, 0.0, atol=1e-6)

@@ -9,38 +9,20 @@ from urllib.parse import parse_qsl
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
+from helpers.datasets import OTM, TRIALS, make_dataset
 from helpers.pages import numbered
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
-from drakegrasp.frames import GRAVITY, invert_pose, transform_points, unpack_pose
+from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.page.attempts import AttemptGallery
 from drakegrasp.page.renders import THUMBNAIL, contact_dots, read_render, read_rows
-from drakegrasp.page.snapshot import FEATURES, Snapshot, read_snapshot
+from drakegrasp.page.snapshot import Snapshot, read_snapshot
 from drakegrasp.vision.camera import intrinsics, project
 
 NOTHING = Decisions()
-
-
-def test_table_is_what_the_files_say(boxes: Path) -> None:
-    snapshot = read_snapshot(boxes)
-    table = snapshot.table
-    with h5py.File(boxes / TRIALS) as file, h5py.File(boxes / OTO) as data:
-        for name in ("outcome", "object", "candidate", "standoff_index", "precision", "stable"):
-            np.testing.assert_array_equal(getattr(table, name), file["trials"][name][:])
-        hits = file["successes/trial_id"][:]
-        np.testing.assert_array_equal(table.removal[hits], file["successes/removal"][:])
-        for number, split in enumerate(("train", "valid", "test")):
-            ids = np.flatnonzero(table.split == number)
-            np.testing.assert_array_equal(ids, data[split]["trial_id"][:])
-    assert (table.removal != NONE).sum() == (table.split != NONE).sum() == 9
-    assert set(FEATURES) < set(table)
-    np.testing.assert_allclose(table.slip[table.precision], SLIP)
-    # The second attempt misses a finger, the third is below the table.
-    assert np.isnan(table.slip[[1, 2]]).all()
 
 
 def test_rows_and_images_are_those_of_the_attempt(boxes: Path) -> None:
@@ -78,24 +60,6 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drawn")
     draws = ("mass=[0.5, 1.5]", "camera_shift=0.02", "camera_turn_deg=10")
     return make_dataset(folder / "out", folder, overrides=[f"randomize.{draw}" for draw in draws])
-
-
-def imbalance(out: Path) -> np.ndarray:
-    """Return that of every attempt; nothing carries the weight.
-
-    The fingertips of every success push with 12.5 N along -y of {O}.
-    """
-    with h5py.File(out / TRIALS) as file:
-        weights = GRAVITY * file["trials/mass"][:]
-        y_T = unpack_pose(file["trials/X_TO_lifted"][:])[:, :3, 1]
-    rest_T = -12.5 * y_T - weights[:, None] * np.array([0.0, 0.0, 1.0])
-    return np.linalg.norm(rest_T, axis=1) / weights
-
-
-def test_anomaly_is_of_the_drawn_mass(drawn: Path) -> None:
-    snapshot, expected = read_snapshot(drawn), imbalance(drawn)
-    for i in (0, 3, 11):
-        assert snapshot.table.imbalance[i] == pytest.approx(expected[i], rel=1e-6)
 
 
 @pytest.mark.parametrize("camera", ["oto", "otm"])

@@ -12,16 +12,13 @@ from helpers.data_files import write_data_file
 from matplotlib.figure import Figure
 
 from drakegrasp.config import CameraConfig
-from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import Field
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.pictures import figures
 from drakegrasp.pictures.figures import (
-    draw_sheet,
     sample_sheet,
-    spread_over_objects,
 )
 from drakegrasp.pictures.style import draw_contacts
 from drakegrasp.vision.camera import intrinsics, project
@@ -88,31 +85,6 @@ def test_the_sheet_of_a_dataset_has_all_objects(
 
 def notes(figure: Figure) -> str:
     return figure.texts[0].get_text()
-
-
-def test_dots_are_where_the_contacts_project(tmp_path: Path) -> None:
-    path = tmp_path / "grasping_oto.hdf5"
-    write_blocks(path, ["1_mug"])
-    data = GraspDataset(path)
-    figure = draw_sheet([data[0]], data.K, far=CAMERA.far)
-    expected = project(K, P_CQ)
-    for axes in figure.axes[:3]:
-        dots = {line.get_gid(): line for line in axes.lines if line.get_gid()}
-        assert sorted(dots) == ["contact 0", "contact 1", "contact 2"]
-        for i, uv in enumerate(expected):
-            np.testing.assert_allclose(dots[f"contact {i}"].get_xydata()[0], uv, atol=1e-4)
-        hollow = [dots[f"contact {i}"].get_markerfacecolor() == "white" for i in range(3)]
-        assert hollow == [False, False, True]
-        assert axes.get_xlim() == (-0.5, 127.5)
-        assert axes.get_ylim() == (127.5, -0.5)
-
-
-def test_samples_are_spread_over_objects() -> None:
-    names = ["10_can"] * 4 + ["2_mug"] * 3 + ["1_box"]
-    assert spread_over_objects(names, 3) == [7, 4, 0]
-    assert spread_over_objects(names, 5) == [7, 4, 5, 0, 1]
-    assert sorted(spread_over_objects(names, 99)) == list(range(8))
-    assert spread_over_objects([f"{i}_x" for i in range(9)], 3) == [0, 4, 8]
 
 
 def test_examples_of_the_docs_run(

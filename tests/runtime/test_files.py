@@ -58,14 +58,6 @@ def test_values_are_not_read_from_where_others_lie(tmp_path: Path) -> None:
         file["mine"][:]
 
 
-def test_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
-    path = tmp_path / "file.h5"
-    with atomic_hdf5(path) as file:
-        file["some"] = np.zeros(3)
-        assert not path.exists()
-    assert everything_in(tmp_path) == [path]
-
-
 def test_file_is_on_the_disk_before_it_has_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

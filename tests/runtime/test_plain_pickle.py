@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import subprocess
 import sys
@@ -102,6 +103,7 @@ ATTACKS = {
         RECONSTRUCT, (np.ndarray, (0,), b"b"), (1, (1000,), np.dtype("f8"), False, b"A" * 8)
     ),
     "zlib": lambda: Call(pickle.loads(b"c_codecs\nencode\n."), ("x", "zlib")),
+    "call": lambda: Call(os.mkdir, ("ran",)),
     "state of a name": lambda: Call(RECONSTRUCT, (np.ndarray, (0,), b"b"), {"parts": 1}),
 }
 
@@ -118,9 +120,9 @@ def test_pickle_that_makes_a_pointer_is_refused_in_a_line(tmp_path, attack):
         "except GraspError as error:\n"
         "    print(error)\n"
     )
-    ran = subprocess.run(
-        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", code, str(path)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert (ran.returncode, ran.stderr) == (0, "")
     assert ran.stdout.startswith(f"{path}: must ")
     assert ran.stdout.count("\n") == 1
+    assert not (tmp_path / "ran").exists()

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from helpers.datasets import OTO
 
-from drakegrasp.api.scoring import score
-from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.scoring.run import VERDICTS
 from drakegrasp.scoring.verdict import rank_file
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
@@ -97,74 +91,17 @@ def test_what_belongs_to_no_row_is_refused(data, tmp_path, changes, words):
 
 def test_postures_that_name_objects_alone_are_for_each_of_their_rows(data, tmp_path):
     names = data.column("object_props/object_name")
-    given = own_postures(data, np.array([0, 0]))
+    given = own_postures(data, np.array([0, 0, 0]))
     del given["row"]
-    np.savez(tmp_path / "p.npz", **given, object=[names[0]] * 2, confidence=[0.1, 0.9])
+    objects = [names[0], names[0], "unknown"]
+    np.savez(tmp_path / "p.npz", **given, object=objects, confidence=[0.1, 0.9, 0.5])
     ranked, rows = rank_file(tmp_path / "p.npz", data), np.flatnonzero(names == names[0])
     assert len(data) != 2
     assert ranked.of_row.tolist() == np.repeat(rows, 2).tolist()
     assert ranked.confidence.tolist() == [0.9, 0.1] * len(rows)
+    assert ranked.left_out.endswith("are left out, as the split has no row of unknown")
 
     # Nobody knows the rows of postures that name neither.
     np.savez(tmp_path / "p.npz", **given)
     with pytest.raises(GraspError, match=r"\(`row` in the file says for which row each is, or `ob"):
         rank_file(tmp_path / "p.npz", data)
-
-
-@pytest.mark.nightly
-@pytest.mark.sim
-@pytest.mark.slow
-def test_own_samples_given_back_as_postures_come_out_as_stored(small_dataset, tmp_path):
-    data = GraspDataset(small_dataset / OTO, split="test")
-    rows = np.arange(min(len(data), 3))
-    assert len(rows) > 1
-    given = own_postures(data, rows)
-    given["X_FG"] = invert_pose(camera_poses(data, rows)) @ given["X_FG"]
-    # A better one by its confidence is no posture, and there is another for the first row.
-    bad = {name: np.concatenate([value, value[:1]]) for name, value in given.items()}
-    bad["X_FG"][-1, :3, 3] = 1e6
-    stated: dict[str, Any] = {"frame": "camera", "confidence": [*np.zeros(len(rows)), 1.0]}
-    np.savez(tmp_path / "net.npz", **bad, **stated)
-    made = score(tmp_path / "net.npz", data, references=["own"], out=tmp_path / "card", workers=1)
-    (judged, _) = made.sets
-    first, *others = (verdict for verdict in judged.verdicts[0])
-    assert first.outcome == "invalid"
-    assert first.reason == "the palm's pose must be within 1000 m, got 1e+06 m"
-    stored = Trials(small_dataset)
-    chosen = data.column("trial_id")[rows]
-    assert all(verdict.lifted and verdict.kept and verdict.matches for verdict in others)
-    assert [verdict.stable for verdict in others] == stored["stable"][chosen].tolist()
-    reached = np.array([verdict.posture for verdict in others])[:, 6:]
-    np.testing.assert_allclose(reached, stored["closed_q"][chosen], atol=1e-3)
-
-    card = made.card["sets"]["net.npz"]
-    assert made.card["sets"]["own"]["what"].startswith("the rows' own")
-    assert card["what"] == "postures"
-    assert card["invalid"] == {first.reason: 1}
-    assert card["measures"]["success@2"]["value"] == 1.0
-    assert card["measures"]["headline"]["value"] < 1.0
-    assert f"1 no grasp: {first.reason}" in made.text
-
-    # Verdicts that are there are not tried again.
-    lines = (tmp_path / "card" / VERDICTS).read_bytes()
-    again = score(tmp_path / "net.npz", data, references=["own"], out=tmp_path / "card")
-    assert again.card == made.card
-    assert (tmp_path / "card" / VERDICTS).read_bytes() == lines
-
-
-def test_a_protocol_cuts_an_object_once_for_all_that_is_scored(data, tmp_path, monkeypatch):
-    """Postures and contacts are tried apart, and nothing is kept for another call."""
-    pytest.importorskip("mujoco")
-    pytest.importorskip("coacd")
-    from drakegrasp import mjcf as cutting
-
-    cut, convex_parts = [], cutting.convex_parts
-
-    def counted(model):
-        cut.append(model.name)
-        return convex_parts(model)
-
-    monkeypatch.setattr(cutting, "convex_parts", counted)
-    np.savez(tmp_path / "net.npz", **own_postures(data, np.array([0])))
-    score(tmp_path / "net.npz", data, references=["own"], protocol="dexgraspbench", workers=1)
-    assert cut == [data.column("object_props/object_name")[0]]

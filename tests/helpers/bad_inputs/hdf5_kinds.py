@@ -133,9 +133,6 @@ ATTRIBUTES: dict[str, Any] = {
     "a text": "x",
     "an array": np.zeros((2, 2)),
     "NaN": np.nan,
-    "texts": np.array(["a", "b"], dtype=object),
-    "bytes of no text": np.bytes_(b"\xff\xfe"),
-    "null": h5py.Empty("f"),
 }
 
 
@@ -195,19 +192,13 @@ TRIALS: tuple[Kind, ...] = (
     attribute_kind("schema_version", "of the future", 999),
     attribute_kind("schema_version", "before", 1),
     attribute_kind("seed", "negative", -1),
-    attribute_kind("near", "negative", -1.0),
     attribute_kind("config", "NaN inside", '{"physics": {"time_step": NaN}}'),
 )
 #: Values that no header shows.
 TRIAL_VALUES: tuple[Kind, ...] = (
-    value_kind("trials/object", "after the last", 0, 3),
-    value_kind("trials/object", "negative", 0, -1),
-    value_kind("trials/outcome", "unknown", 0, 200),
     value_kind("successes/trial_id", "after the last", 0, 36),
     value_kind("successes/trial_id", "negative", 0, -1),
-    value_kind("successes/removal", "unknown", 0, 200),
     value_kind("objects/name", "no UTF-8", 0, b"\xff\xfe"),
-    value_kind("objects/name", "steers a terminal", 0, "a\x1b]0;x\x07"),
     value_kind("objects/class_name", "no UTF-8", 0, b"\xff\xfe"),
 )
 DATA: tuple[Kind, ...] = (
@@ -224,14 +215,6 @@ DATA: tuple[Kind, ...] = (
     attribute_kind("camera", "unknown", "stereo"),
     attribute_kind("schema_version", "of the future", 999),
     attribute_kind("K", "of 9 numbers", np.ones(9)),
-)
-#: What only a comparison with the manifest shows.
-CONTRADICTIONS: tuple[Kind, ...] = (
-    attribute_kind("config_hash", "another", "0123456789abcdef"),
-    attribute_kind("seed", "another", 12),
-    attribute_kind("near", "another", 0.02),
-    attribute_kind("far", "another", 0.8),
-    attribute_kind("K", "another", np.eye(3)),
 )
 #: Shards and plans have a seal, which proves that they are as they were written.
 SEALED: tuple[Kind, ...] = (

@@ -2,28 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
-import yaml
 from helpers.bad_inputs.kinds import ANY_TEXT, Kind, whole_file
-
-#: Values of a key of YAML by the name of the way.
-VALUES: dict[str, Any] = {
-    "null": None,
-    "text": "x",
-    "list": [],
-    "list of lists": [[[]]],
-    "mapping": {"a": 1},
-    "truth value": True,
-    "negative": -1,
-    "zero": 0,
-    "NaN": float("nan"),
-    "infinite": float("inf"),
-    "huge": 10**30,
-    "date": "2026-01-01T00:00:00Z",
-}
-
+from helpers.bad_inputs.trees import keys, ways
 
 #: Texts that are no YAML, or none that anybody reads.
 ANY_YAML: tuple[Kind, ...] = (
@@ -50,106 +30,24 @@ ANY_YAML: tuple[Kind, ...] = (
 )
 
 
-def keys(wrong: dict[str, tuple[str, ...]]) -> list[Kind]:
-    """Return kinds in which a key, dotted, has one of some wrong values."""
-    return [
-        Kind(f"{key} {way}", lambda path, k=key, w=way: _put(path, k, VALUES[w]))
-        for key, ways in wrong.items()
-        for way in ways
-    ]
-
-
-def without(*names: str) -> list[Kind]:
-    """Return kinds in which a key, dotted, is missing."""
-    return [Kind(f"{key} missing", lambda path, k=key: _put(path, k, ...)) for key in names]
-
-
-def _put(path: Path, key: str, value: Any) -> None:
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    *parents, last = (int(part) if part.isdecimal() else part for part in key.split("."))
-    node = content
-    for part in parents:
-        node = node[part]
-    if value is ...:
-        del node[last]
-    else:
-        node[last] = value
-    path.write_text(yaml.safe_dump(content))
-
-
 _NO_NUMBER = ("text", "list", "mapping", "truth value", "NaN", "infinite", "date")
-CONFIG: tuple[Kind, ...] = (
-    *ANY_YAML,
-    *keys(
-        {
-            "seed": (*_NO_NUMBER, "null", "negative", "huge"),
-            "builtin.seed": (*_NO_NUMBER, "negative", "huge"),
-            "candidates.max": (*_NO_NUMBER, "null", "negative", "zero", "huge"),
-            "unit_candidates": (*_NO_NUMBER, "negative", "zero", "huge"),
-            "physics.time_step": (*_NO_NUMBER, "null", "negative", "zero", "huge"),
-            "lift.hold_time": (*_NO_NUMBER, "null", "negative", "huge"),
-            "camera.size": (*_NO_NUMBER, "null", "negative", "zero", "huge"),
-            "candidates.standoffs": (*_NO_NUMBER, "negative", "list of lists"),
-            "hand": ("list", "mapping", "truth value", "zero", "null"),
-            "split.by": ("text", "list", "mapping", "truth value", "null", "zero"),
-            "split.train_classes": ("text", "mapping", "zero"),
-            "physics": ("text", "list", "truth value", "negative"),
-        }
-    ),
-)
-OBJECTS: tuple[Kind, ...] = (
-    *ANY_YAML,
-    *keys(
-        {
-            "units": ("text", "list", "mapping", "truth value", "zero"),
-            "licence": ("list", "mapping", "truth value"),
-            "objects": ("text", "list", "mapping", "truth value", "zero"),
-            "objects.1_box_a": ("text", "list", "mapping", "truth value", "zero"),
-            "objects.1_box_a.mass": (*_NO_NUMBER, "negative", "zero"),
-            "objects.1_box_a.density": (*_NO_NUMBER, "negative", "zero"),
-            "objects.1_box_a.friction": (*_NO_NUMBER, "negative", "zero"),
-            "objects.1_box_a.scale": (*_NO_NUMBER, "null", "negative", "zero"),
-            "objects.1_box_a.up": ("text", "list", "mapping", "truth value", "null", "zero"),
-            "objects.1_box_a.class": ("list", "mapping", "truth value"),
-            "objects.1_box_a.name": ("list", "mapping", "truth value"),
-            "objects.1_box_a.group": ("list", "mapping", "truth value"),
-        }
-    ),
-)
+_HAND_KEYS = {
+    ("version",): (*_NO_NUMBER, "null", "negative", "zero"),
+    ("model",): ("text", "list", "mapping", "truth value", "null", "zero"),
+    ("palm", "link"): ("text", "list", "mapping", "null", "zero"),
+    ("palm", "p_BG"): (*_NO_NUMBER, "null", "list of lists"),
+    ("fingers",): ("text", "list", "mapping", "null"),
+    ("fingers", 0, "name"): ("list", "mapping", "null", "zero"),
+    ("fingers", 0, "closing_joint"): ("text", "list", "null"),
+    ("fingers", 0, "pad_point"): (*_NO_NUMBER, "null"),
+    ("standoffs",): (*_NO_NUMBER, "null", "negative", "list of lists"),
+}
 HAND: tuple[Kind, ...] = (
     *ANY_YAML,
-    *without(
-        "version",
-        "model",
-        "palm",
-        "fingers",
-        "standoffs",
-        "palm.link",
-        "palm.p_BG",
-        "fingers.0.name",
-        "fingers.0.fingertip",
-        "fingers.0.closing_joint",
-        "fingers.0.pad_point",
-    ),
-    *keys(
-        {
-            "version": (*_NO_NUMBER, "null", "negative", "zero"),
-            "model": ("text", "list", "mapping", "truth value", "null", "zero"),
-            "palm": ("text", "list", "mapping", "null"),
-            "palm.link": ("text", "list", "mapping", "null", "zero"),
-            "palm.p_BG": (*_NO_NUMBER, "null", "list of lists"),
-            "fingers": ("text", "list", "mapping", "null"),
-            "fingers.0": ("text", "list", "mapping", "null"),
-            "fingers.0.name": ("list", "mapping", "null", "zero"),
-            "fingers.0.fingertip": ("text", "list", "null"),
-            "fingers.0.closing_joint": ("text", "list", "null"),
-            "fingers.0.pad_point": (*_NO_NUMBER, "null"),
-            "fingers.0.required": ("text", "list", "null"),
-            "standoffs": (*_NO_NUMBER, "null", "negative", "list of lists"),
-            "closing_speed_deg": ("text", "list", "null", "negative", "zero", "NaN", "infinite"),
-            "drive": ("text", "list", "null", "zero"),
-        }
-    ),
+    *keys(_HAND_KEYS),
+    *ways(("fingers", 0, "required"), "text", "list", "null"),
+    *ways(("closing_speed_deg",), "text", "list", "null", "negative", "zero", "NaN", "infinite"),
+    *ways(("drive",), "text", "list", "null", "zero"),
 )
 
 _EXTREME = ("", " ", "x", "1.5", "nan", "inf", "1e3", "-1", str(10**30), "9" * 5000, "٣x")
