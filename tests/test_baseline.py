@@ -31,7 +31,6 @@ from assess import assessment, auc
 from batches import centred, object_points, turned
 from fitting import ahead
 from networks import (
-    ContactNetwork,
     HandCoordinates,
     PostureNetwork,
     PostureSize,
@@ -170,24 +169,6 @@ def test_batches_are_made_ahead_in_their_order() -> None:
     with pytest.raises(ValueError, match="a damaged file"):
         next(given)
     assert not list(ahead(iter(range(0))))
-
-
-def test_several_heads_learn_two_answers_and_one_their_mean() -> None:
-    torch.manual_seed(0)
-    images = torch.zeros(8, 4, 32, 32)
-    grasps = torch.tensor([[-1.0] * 6, [1.0] * 6]).repeat(4, 1)
-    found = {}
-    for heads in (1, 2):
-        network = ContactNetwork(6, heads, torch.zeros(6), torch.ones(6))
-        network(images)
-        optimizer = torch.optim.Adam(network.parameters(), 0.01)
-        for _ in range(60):
-            optimizer.zero_grad()
-            network.loss(images, grasps).backward()
-            optimizer.step()
-        found[heads] = network(images)[0][0].mean(-1).sort().values
-    assert found[1].abs().max() < 0.2
-    assert torch.allclose(found[2], torch.tensor([-1.0, 1.0]), atol=0.3)
 
 
 def test_temperature_makes_confident_logits_honest() -> None:

@@ -84,19 +84,6 @@ def test_postures_of_rows_are_tried_with_the_friction_and_mass_of_their_rows(
     assert told.row.tolist() == rows.tolist()
 
 
-def test_postures_without_rows_are_tried_on_the_objects_that_they_name(
-    drawn: Path, tmp_path: Path
-) -> None:
-    data = GraspDataset(drawn / OTO, split="train")
-    names = ["cup", *data.column("object_props/object_name")[1:]]
-    path = posture_file(tmp_path / "p.npz", data, object=names)
-    grasps, _, _ = place(path, Target(dataset=drawn / OTO))
-    found = {grasp.index: grasp for grasp in grasps}
-    assert [found[i].placed.model.name for i in range(len(data))] == names
-    assert found[0].invalid.startswith("object must be one of 1_box_a, 2_box_b, 3_brick, got 'cup'")
-    assert not any(found[i].invalid for i in range(1, len(data)))
-
-
 @pytest.mark.sim
 @pytest.mark.parametrize(
     ("names", "words", "count"),

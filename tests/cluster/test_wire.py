@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import filecmp
-import itertools
 import os
 import pickle
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import h5py
@@ -25,16 +22,13 @@ from helpers.file_tasks import Join, join
 from helpers.tiers import in_second_tier
 from server.processes import small_cluster
 
-from drakegrasp import build_dataset
 from drakegrasp.cluster import wire
 from drakegrasp.cluster.apart import ProcessApart
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.cluster.wire import by_wire
 from drakegrasp.cluster.worker_checks import checked_workers
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import MachineError
-from drakegrasp.generation.pipeline import BuildReport
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool
@@ -226,76 +220,6 @@ def test_every_kind_of_task_gives_the_same_bytes(
     assert_same_files(here, out)
     with h5py.File(out / "trials.hdf5") as file:
         assert file["trials/outcome"][0] == Outcome.SUCCESS
-
-
-@pytest.mark.nightly
-@pytest.mark.sim
-def test_client_that_stopped_goes_on_and_a_killed_worker_changes_nothing(
-    meshes: Path,
-    out: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    """The workers have another working directory, so they do not see the dataset."""
-    config, here = load_config(overrides=FAST), tmp_path / "here"
-    build(meshes, here, config)
-    monkeypatch.chdir(meshes)
-    with connect(workers=2) as client:
-        monkeypatch.chdir(tmp_path)
-
-        def build_by_workers() -> BuildReport:
-            return build_dataset(meshes, out, config=config, client=client, show=False)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(wire._Wire, "_write", stop_after(3, wire._Wire._write))
-            with pytest.raises(KeyboardInterrupt):
-                build_by_workers()
-        done = len(list(out.glob("shards/*/*.h5")))
-        assert 0 < done < 6
-        pids = list(client.run(os.getpid).values())
-        with monkeypatch.context() as patch:
-            killing = kill_after(1, pids[0], wire._Wire._packed)
-            patch.setattr(wire._Wire, "_packed", killing)
-            report = build_by_workers()
-        assert (report.reused, report.simulated) == (done, 6 - done)
-        assert pids[0] not in client.run(os.getpid).values()
-
-        # Verdicts need the dataset's hand there.
-        hand = read_manifest(out).config
-        with (
-            pytest.raises(MachineError, match=r"must have hand \w+ like the client, got none"),
-            checked_workers(client, hand),
-        ):
-            raise AssertionError
-    assert_same_files(here, out)
-    line = f"2 of 2 workers do not see {out} and the meshes: files travel over the network"
-    assert capfd.readouterr().err.splitlines() == [line, line]
-
-
-def stop_after(count: int, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that is interrupted after some calls."""
-    calls = itertools.count(1)
-
-    def stopping(*args: Any) -> Any:
-        result = function(*args)
-        if next(calls) == count:
-            raise KeyboardInterrupt
-        return result
-
-    return stopping
-
-
-def kill_after(count: int, pid: int, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that kills a process half a second after some calls."""
-    calls = itertools.count(1)
-
-    def killing(*args: Any) -> Any:
-        if next(calls) == count:
-            threading.Timer(0.5, os.kill, [pid, signal.SIGKILL]).start()
-        return function(*args)
-
-    return killing
 
 
 @pytest.mark.nightly

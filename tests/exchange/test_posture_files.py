@@ -28,10 +28,6 @@ PREGRASP, SQUEEZE = GRASP - 0.05, GRASP + 0.05
 OBJECTS = ["mug", "can"]
 
 
-#: A file of postures in the folder of an export.
-ONE_FILE = {"isaac_grasp": "*.yaml", "dexgraspbench": "*.npy"}
-
-
 def quaternion(X: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(X[:3, :3]).as_quat(scalar_first=True)
 
@@ -493,27 +489,6 @@ def test_rows_without_an_object_are_of_the_one_that_is_named(tmp_path):
     del content["object"]
     np.savez(tmp_path / "p.npz", **content)
     assert read_attempts(tmp_path / "p.npz", HAND, of="cup").objects == ("cup", "cup")
-
-
-def test_samples_that_were_exported_come_back(exported, grasps):
-    hand = load_hand()
-    spread = hand.spread.joints[0]
-    for form in ONE_FILE:
-        table = read_attempts(exported(form), hand)
-        assert table.frame == "object"
-        assert sorted(table.objects) == sorted(grasp.object_name for grasp in grasps)
-        assert np.abs(table.q_pregrasp[:, hand.joint_order.index(spread)]).min() > 0.0
-        for i, name in enumerate(table.objects):
-            assert any(
-                np.allclose(grasp.X_TO @ table.X_FG[i], grasp.X_TG, atol=1e-9)
-                and np.allclose(grasp.X_TO, table.X_TO[i], atol=1e-9)
-                and (grasp.q == table.q_grasp[i]).all()
-                and (grasp.conditions == table.conditions[i]).all()
-                for grasp in grasps
-                if grasp.object_name == name
-            )
-        with pytest.raises(GraspError, match="hand must be barrett, as the file says"):
-            read_attempts(next(exported(form).rglob(ONE_FILE[form])), HAND)
 
 
 def test_without_a_dataset_rows_are_not_asked_and_confidence_is_one_per_row(tmp_path):

@@ -27,6 +27,7 @@ from drakegrasp.dataset.check import check_dataset
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import GraspError
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.exchange.export import export_dataset
 from drakegrasp.frames import unpack_pose
@@ -176,6 +177,10 @@ def test_what_goes_out_comes_in_again(
     np.testing.assert_allclose(table.q_grasp, samples["closed_q"][order], atol=1e-6)
     names = [hand.preshape_names[k] for k in samples["preshape"][order]]
     assert list(table.preshape) == names
+    if form not in OWN:
+        one = next(path.rglob("*.npy"), None) or next(path.rglob("*.yaml"))
+        with pytest.raises(GraspError, match=f"hand must be {HAND}, as the file says"):
+            read_attempts(one, load_hand())
     stored = [("success", bool(stable), True) for stable in samples["stable"][order]]
 
     # By the mesh alone, and by the objects or rows of the dataset.
