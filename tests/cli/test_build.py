@@ -46,19 +46,6 @@ def state(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Read only: copy it to change it."""
-    folder = tmp_path_factory.mktemp("whole")
-    (folder / "meshes").mkdir()
-    return make_dataset(folder / "out", folder / "meshes")
-
-
-@pytest.fixture
-def out(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "out"))
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -210,9 +197,9 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
         assert line in result.stderr
 
 
-def test_few_crashes_are_no_error(whole: Path) -> None:
-    counts = Counts(read_manifest(whole), None, None, silent)
-    header = next(read_manifest(whole).headers())
+def test_few_crashes_are_no_error(sound: Path) -> None:
+    counts = Counts(read_manifest(sound), None, None, silent)
+    header = next(read_manifest(sound).headers())
     for crashed, said in ((9, 0), (1, 1)):
         outcomes = {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed}
         counts.add(UnitSummary(header=header, outcomes=outcomes, errors={}))

@@ -5,27 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import relift
-from helpers.datasets import make_dataset
 
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.outcomes import Outcome
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("out") / "data", tmp_path_factory.mktemp("meshes"))
-
-
 @pytest.mark.parametrize("kind", ["attempts", "lifts", "samples", "both"])
-def test_drawn_rows_are_of_their_kind(dataset, kind):
-    trials = Trials(dataset)
+def test_drawn_rows_are_of_their_kind(sound, kind):
+    trials = Trials(sound)
     samples = set(trials.where(kept=True).trial_ids.tolist())
     lifts = set(trials.trial_ids[np.isfinite(trials["time_lift"])].tolist())
     closed = set(trials.trial_ids[np.isfinite(trials["time_close"])].tolist())
     every = {"attempts": closed, "samples": samples}.get(kind, lifts)
-    assert set(relift.chosen_rows(dataset, kind, 1000, 0).tolist()) == every
-    few = relift.chosen_rows(dataset, kind, 2, 0).tolist()
-    assert few == relift.chosen_rows(dataset, kind, 2, 0).tolist()
+    assert set(relift.chosen_rows(sound, kind, 1000, 0).tolist()) == every
+    few = relift.chosen_rows(sound, kind, 2, 0).tolist()
+    assert few == relift.chosen_rows(sound, kind, 2, 0).tolist()
     if kind == "both":
         assert len(set(few) & samples) == len(set(few) - samples) == 2
     else:

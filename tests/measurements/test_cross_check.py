@@ -16,21 +16,16 @@ from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("out") / "data", tmp_path_factory.mktemp("meshes"))
-
-
 def names(file):
     return [name.decode() for name in file["objects/name"][:]]
 
 
-def test_drawn_lifts_are_what_the_dataset_says(dataset):
-    lifts = draw_lifts(dataset, 1000)
+def test_drawn_lifts_are_what_the_dataset_says(sound):
+    lifts = draw_lifts(sound, 1000)
     # Per object three successes, and three lifts that were lost: slipped, dropped, on the table.
     assert len(lifts) == 6 * len(BOXES)
     assert len({lift.trial_id for lift in lifts}) == len(lifts)
-    with h5py.File(dataset / TRIALS) as file:
+    with h5py.File(sound / TRIALS) as file:
         removals = dict(zip(file["successes/trial_id"], file["successes/removal"], strict=True))
         for lift in lifts:
             row = lift.trial_id
@@ -46,7 +41,6 @@ def test_drawn_lifts_are_what_the_dataset_says(dataset):
 
 
 def test_drawn_lifts_have_their_own_friction_and_mass(tmp_path):
-    (tmp_path / "meshes").mkdir()
     ranges = ("randomize.mass=[0.5,1.5]", "randomize.friction_hand=[0.7,1.3]")
     out = make_dataset(tmp_path / "data", tmp_path / "meshes", overrides=ranges)
     lifts = draw_lifts(out, 10)
@@ -57,16 +51,14 @@ def test_drawn_lifts_have_their_own_friction_and_mass(tmp_path):
     assert len({lift.materials for lift in lifts}) == len(lifts)
 
 
-def test_lift_without_a_verdict_is_no_lost_one(dataset, tmp_path):
-    out = make_dataset(tmp_path / "data", tmp_path)
+def test_lift_without_a_verdict_is_no_lost_one(sound, out):
     change(out, TRIALS, "trials/outcome", SLIPPED, lambda _: Outcome.MOVED)
-    drawn = [{lift.trial_id for lift in draw_lifts(each, 1000)} for each in (dataset, out)]
+    drawn = [{lift.trial_id for lift in draw_lifts(each, 1000)} for each in (sound, out)]
     assert drawn[0] - drawn[1] == {SLIPPED}
 
 
-def test_groups_and_objects_take_turns(dataset, tmp_path):
+def test_groups_and_objects_take_turns(out):
     """With every second success removed, each group has lifts of each object."""
-    out = make_dataset(tmp_path / "data", tmp_path)
     with h5py.File(out / TRIALS, "r+") as file:
         file["successes/removal"][::3] = Removal.OUTLIER
     lifts = draw_lifts(out, 9)
@@ -101,15 +93,15 @@ def test_agreement_counts_what_is_lifted_there():
 
 
 @pytest.mark.sim
-def test_command_prints_the_agreement(dataset, tmp_path):
+def test_command_prints_the_agreement(sound, tmp_path):
     pytest.importorskip("mujoco")
     pytest.importorskip("coacd")
     path = tmp_path / "report.json"
-    result = CliRunner().invoke(main, [str(dataset), "6", "--out", str(path)])
+    result = CliRunner().invoke(main, [str(sound), "6", "--out", str(path)])
     assert result.exit_code == 0, result.output
     report = json.loads(path.read_text())
     assert [row["trial_id"] for row in report["lifts"]] == sorted(
-        lift.trial_id for lift in draw_lifts(dataset, 6)
+        lift.trial_id for lift in draw_lifts(sound, 6)
     )
     assert sum(counts["drawn"] for counts in report["groups"].values()) == 6
     assert report["drive"] == "worm"

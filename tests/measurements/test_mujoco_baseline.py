@@ -11,7 +11,6 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.hand.kinematics import fingertip_poses, joint_positions
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.hand_setup import trial_grasps
@@ -23,7 +22,6 @@ pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
 import mujoco
-import mujoco_baseline
 from mujoco_baseline import MujocoBaseline
 from mujoco_scene import build_mujoco_scene
 
@@ -146,32 +144,6 @@ def test_drive_and_friction_decide_whether_a_pinched_box_stays(
     trial = peer(pinched, *rules).run(from_above(pinched, STANDOFF))
     assert slip[0] <= trial.slip < slip[1]
     assert np.deg2rad(turn[0]) <= trial.turn <= np.deg2rad(turn[1])
-
-
-def weak(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
-    """Let the hand of the next peers have other fingers."""
-    hand = load_hand()
-    fingers = tuple(replace(finger, **changes) for finger in hand.fingers)  # type: ignore[arg-type]
-    monkeypatch.setattr(
-        mujoco_baseline, "load_plain_hand", lambda *_: replace(hand, fingers=fingers)
-    )
-
-
-def test_contact_beside_the_pad_and_its_band_is_of_another_link(
-    cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A corner of each fingertip's shape meets the cube, 54.7 mm from the distal joint."""
-    attempt, x = from_above(cube, STANDOFF), 0.0547
-    at = (0.06, 0.0, 0.0)
-    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, x + 0.5 * PAD_BAND),), pad_point=at)
-    baseline = peer(cube)
-    assert baseline.run(attempt).outcome is Outcome.SUCCESS
-    assert baseline._contacts().other_links == 0
-
-    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, x + 1.5 * PAD_BAND),), pad_point=at)
-    baseline = peer(cube)
-    assert baseline.run(attempt).outcome is Outcome.MISSING_FINGERTIP
-    assert baseline._contacts().other_links == 3
 
 
 def test_own_friction_of_the_object_is_that_of_both_pairs(cube: ObjectModel) -> None:

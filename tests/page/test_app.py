@@ -248,9 +248,9 @@ def test_a_page_names_the_file_of_meshes_that_is_not_there(client: TestClient, o
 
 
 @pytest.mark.parametrize("path", ["/", "/grasp/0-0-0"])
-def test_pages_say_how_to_take_rejected_grasps_out(boxes: Path, tmp_path: Path, path: str) -> None:
+def test_pages_say_how_to_take_rejected_grasps_out(sound: Path, tmp_path: Path, path: str) -> None:
     """The command can be pasted into a shell, whatever the directory is called."""
-    out = Path(shutil.copytree(boxes, tmp_path / "my data;x"))
+    out = Path(shutil.copytree(sound, tmp_path / "my data;x"))
     client = open_pages(out)
     hidden = [a for _, a in Tags(get(client, path).text).tags if a.get("id") == "nextstep"]
     assert "hidden" in hidden[0]

@@ -83,9 +83,9 @@ def _is_ours(url: str) -> bool:
 
 
 @pytest.fixture
-def state(boxes: Path) -> Snapshot:
+def state(sound: Path) -> Snapshot:
     """Of the dataset that is shown: objects have codes in addresses."""
-    return read_snapshot(boxes)
+    return read_snapshot(sound)
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.datasets import REPEATED, make_dataset
 from helpers.golden import Golden, flat, rounded
 from helpers.pages import get, inspection_of, open_pages
 from helpers.predictions import write_predictions
@@ -30,13 +29,6 @@ def tags(page: str, **replaced: object) -> str:
     return rounded("\n".join([*(line.strip() for line in lines if line.strip()), *values]))
 
 
-@pytest.fixture(scope="module")
-def repeated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset with all columns that there are. Read only."""
-    folder = tmp_path_factory.mktemp("golden")
-    return make_dataset(folder / "out", folder, overrides=REPEATED)
-
-
 @pytest.mark.parametrize(
     ("name", "address"),
     [
@@ -48,12 +40,12 @@ def repeated(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("prediction_not_closed", "/prediction/2"),
     ],
 )
-def test_page(repeated: Path, tmp_path: Path, golden: Golden, name: str, address: str) -> None:
-    client = open_pages(repeated, write_predictions(repeated, tmp_path / "run.h5"))
+def test_page(out: Path, tmp_path: Path, golden: Golden, name: str, address: str) -> None:
+    client = open_pages(out, write_predictions(out, tmp_path / "run.h5"))
     answer = get(client, address)
     assert answer.status_code == 200
     # The head and the dialogs of all pages are those of the gallery.
     text = answer.text
     if name != "gallery":
         text = "".join(re.findall(r"<script type=.*?</script>|<main.*?</main>", text, re.DOTALL))
-    golden(f"pages/{name}", tags(text, OUT=repeated, TOKEN=inspection_of(client).token))
+    golden(f"pages/{name}", tags(text, OUT=out, TOKEN=inspection_of(client).token))

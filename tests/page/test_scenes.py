@@ -23,9 +23,9 @@ pytestmark = pytest.mark.sim
 
 
 @pytest.fixture(scope="module")
-def made(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset with scenes. Read only."""
-    out = Path(shutil.copytree(boxes, tmp_path_factory.mktemp("scenes") / "boxes"))
+    out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("scenes") / "sound"))
     make_scenes(out, overrides=["scenes.views=3"])
     return out
 
@@ -172,7 +172,7 @@ def test_file_that_cannot_be_shown_is_a_line(
     assert 'href="/scenes"' in client.get("/").text
 
 
-def test_without_scenes_there_is_no_link(boxes: Path, tmp_path: Path) -> None:
-    client = open_pages(boxes)
+def test_without_scenes_there_is_no_link(sound: Path, tmp_path: Path) -> None:
+    client = open_pages(sound)
     assert "scenes" not in client.get("/").text
     assert client.get("/scenes").status_code == 404

@@ -31,12 +31,12 @@ def test_only_the_loopback_address_is_listened_on() -> None:
         assert listener.getsockname()[0] == LOOPBACK == "127.0.0.1"
 
 
-def test_a_taken_port_is_one_line(boxes: Path) -> None:
+def test_a_taken_port_is_one_line(sound: Path) -> None:
     with socket.socket() as other:
         other.bind((LOOPBACK, 0))
         other.listen()
         port = str(other.getsockname()[1])
-        result = run("inspect", str(boxes), "--port", port, "--no-browser")
+        result = run("inspect", str(sound), "--port", port, "--no-browser")
     assert result.exit_code == 1
     assert result.stderr.startswith(f"error: --port must be free on this machine, got {port}")
 
@@ -62,7 +62,7 @@ def test_a_build_that_has_not_ended_is_one_line_that_says_how_to_end_it(out: Pat
 
 @pytest.mark.parametrize("library", ["starlette", "uvicorn", "jinja2"])
 def test_missing_extra_is_one_line(
-    library: str, boxes: Path, monkeypatch: pytest.MonkeyPatch
+    library: str, sound: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in list(sys.modules):
         if name.startswith("drakegrasp.page"):
@@ -71,15 +71,15 @@ def test_missing_extra_is_one_line(
             monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.setattr("socket.socket.listen", None)  # else a mistake would serve for ever
-    result = run("inspect", str(boxes), "--no-browser")
+    result = run("inspect", str(sound), "--no-browser")
     assert result.exit_code == 1
     (line,) = result.stderr.splitlines()
     assert line.startswith("error: inspect needs its packages: pip install 'drakegrasp[inspect]' (")
     assert library in line
 
 
-def test_command_serves_until_it_is_stopped(boxes: Path) -> None:
-    command = [sys.executable, "-c", CODE, "inspect", str(boxes), "--port", "0", "--no-browser"]
+def test_command_serves_until_it_is_stopped(sound: Path) -> None:
+    command = [sys.executable, "-c", CODE, "inspect", str(sound), "--port", "0", "--no-browser"]
     server = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
     )

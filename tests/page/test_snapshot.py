@@ -25,13 +25,13 @@ from drakegrasp.vision.camera import intrinsics, project
 NOTHING = Decisions()
 
 
-def test_rows_and_images_are_those_of_the_attempt(boxes: Path) -> None:
-    with h5py.File(boxes / TRIALS) as trials, h5py.File(boxes / OTM) as data:
+def test_rows_and_images_are_those_of_the_attempt(sound: Path) -> None:
+    with h5py.File(sound / TRIALS) as trials, h5py.File(sound / OTM) as data:
         X_OG = trials["trials/X_OG"][15]
         split = next(s for s in data if 15 in data[s]["trial_id"][:])
         place = data[split]["trial_id"][:].tolist().index(15)
         image, mask = data[split]["images"][place], data[split]["masks"][place]
-    snapshot = read_snapshot(boxes)
+    snapshot = read_snapshot(sound)
     i = snapshot.find(AttemptKey("2_box_b", 1, 0))
     assert i == 15 and str(snapshot.key(i)) == "2_box_b, palm pose 1, stand-off 0"
     assert snapshot.find(AttemptKey("2_box_b", 99, 0)) is None
@@ -82,8 +82,8 @@ def test_dots_are_where_the_moved_camera_sees_the_contacts(drawn: Path, camera: 
 
 
 @pytest.fixture
-def snapshot(boxes: Path) -> Snapshot:
-    return read_snapshot(boxes)
+def snapshot(sound: Path) -> Snapshot:
+    return read_snapshot(sound)
 
 
 def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:
