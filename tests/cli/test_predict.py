@@ -25,13 +25,10 @@ def files(tmp_path: Path) -> Path:
     Image.fromarray(mask).save(tmp_path / "mask.png")
     Image.fromarray(~mask | mask).save(tmp_path / "all.png")
     np.save(tmp_path / "one.npy", np.ones((4, 5)))
-    millimetres = X_TC.copy()
-    millimetres[:3, 3] *= 1e3
-    poses = {"X_TC": X_TC, "X_CT": invert_pose(X_TC), "mm": millimetres}
-    for name, pose in poses.items():
+    for name, pose in {"X_TC": X_TC, "X_CT": invert_pose(X_TC)}.items():
         np.save(tmp_path / f"{name}.npy", pose)
     corners = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3)) * [0.04, 0.03, 0.05]
-    for name, z in {"cloud": 0.05, "centred": 0.0, "below": -0.2, "camera": 0.6}.items():
+    for name, z in {"cloud": 0.05, "below": -0.2}.items():
         np.save(tmp_path / f"{name}.npy", corners + np.array([0.0, 0.0, z]))
     np.save(tmp_path / "nan.npy", np.where(corners > 0.03, np.nan, corners))
     np.save(tmp_path / "far.npy", 1e3 * corners)
@@ -60,7 +57,6 @@ def predict(files: Path, words: str):
     ("words", "said"),
     [
         (f"{SEEN} --camera-pose X_CT.npy", "is it inverted (X_CT), or in another unit?"),
-        (f"{SEEN} --camera-pose mm.npy", "is it inverted (X_CT), or in another unit?"),
         ("cloud.npy --units cm", "must be points (n, 3) of one object"),
         ("cloud.npy --mask cloud.npy", "--mask must be given with a depth image only, got a cloud"),
         ("cloud.npy --split test", "--split must be given with scenes only, got a cloud"),
@@ -73,9 +69,7 @@ def predict(files: Path, words: str):
         (f"{NINE} --mask one.npy", "mask must be 0 beside the object"),
         (f"{NINE} --mask one.npy --depth-scale 2", "with a .png only"),
         ("a.txt", "INPUT must be .hdf5, .npy, .ply or .png"),
-        ("centred.npy", "the table must be z = 0"),
         ("below.npy", "the table must be z = 0"),
-        ("camera.npy", "the table must be z = 0"),
         (SEEN.replace("mask.png", "all.png"), "must be 0 beside the object"),
         (SEEN.replace("80.0", "160.0"), "for another resolution?"),
         (

@@ -15,10 +15,8 @@ from helpers.commands import run
 from helpers.datasets import OTO, TRIALS, edit_manifest
 
 from drakegrasp.api.building import build_dataset
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
-from drakegrasp.hand.folder import carry_hand
 from drakegrasp.page.gallery import TEMPLATES
 from drakegrasp.runtime.environment import host_label
 
@@ -46,14 +44,6 @@ def test_lock_that_is_a_link_is_not_written(
     assert "must be a file of its own, got a link" in told or "symbolic links" in told
     assert run("stats", out).exit_code == 0
     assert victim.read_text() == "mine\n"
-
-
-def test_assemble_says_that_the_hand_is_another_one(out: Path) -> None:
-    carry_hand(out, read_manifest(out).config)
-    with (out / "hand" / "barrett_hand.yaml").open("a") as file:
-        file.write("# changed\n")
-    said = run("assemble", out).stdout.splitlines()
-    assert said[-1].startswith("hand: the hand must be that of manifest.json, ")
 
 
 @pytest.mark.parametrize("folder", ["shards", "shards/1_box_a", "objects", "builtin"])

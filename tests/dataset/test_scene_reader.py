@@ -59,14 +59,6 @@ def test_points_lie_on_object_and_table(path: Path, frame: Any) -> None:
     assert np.abs(np.abs(p_OQ) - half).min(axis=1).max() < 1e-3
 
 
-def test_items_are_the_same_in_both_frames(path: Path) -> None:
-    table, camera = (SceneDataset(path, points=64, frame=f)[5] for f in ("table", "camera"))
-    for name in ("p_AQ", "points"):
-        moved = transform_points(table["X_TC"], camera[name].reshape(-1, 3))
-        np.testing.assert_allclose(moved, table[name].reshape(-1, 3), atol=1e-6)
-    np.testing.assert_allclose(table["X_TC"] @ camera["X_AG"], table["X_AG"], atol=1e-6)
-
-
 def test_good_and_bad_grasps_come_in_turns(path: Path) -> None:
     data = SceneDataset(path, points=16, grasps=6, split="test")
     for item in data:

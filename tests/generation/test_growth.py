@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeAlias
 
-import h5py
 import numpy as np
 import pytest
 import trimesh
 from helpers.builds import build
 from helpers.meshes import write
 
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.reader import FIELDS, GraspDataset
 from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.hand.settings import load_config
 
 #: An attempt in any dataset: its object, resting pose, palm pose and stand-off.
@@ -36,34 +38,22 @@ def grown(folder: Path, out: Path, names: list[str], samples: int) -> None:
 def rows(out: Path) -> tuple[dict[Identity, Row], dict[tuple[str, Identity], tuple[str, Row]]]:
     """Return the attempts by identity; and the split and row of each sample, by file too."""
 
-    def taken(group: h5py.Group, number: int) -> list[Row]:
-        columns = dict[str, np.ndarray]()
+    def taken(columns: Mapping[str, np.ndarray], i: int) -> Row:
+        own = (name for name in columns if name not in ("trial_id", "object"))
+        return {name: np.asarray(columns[name][i]).tobytes() for name in own}
 
-        def add(name: str, item: object) -> None:
-            if isinstance(item, h5py.Dataset) and name not in ("trial_id", "object"):
-                columns[name] = item.asstr()[:].astype(str) if item.dtype == object else item[:]
-
-        group.visititems(add)
-        return [
-            {name: values[i].tobytes() for name, values in columns.items()} for i in range(number)
-        ]
-
-    with h5py.File(out / TRIALS_FILE) as file:
-        trials, names = file["trials"], file["objects/name"].asstr()[:].tolist()
-        keys = [
-            trials[name][:].tolist()
-            for name in ("object", "resting", "candidate", "standoff_index")
-        ]
-        of = [(names[k], *rest) for k, *rest in zip(*keys, strict=True)]
-        identity = dict(zip(trials["trial_id"][:].tolist(), of, strict=True))
-        attempts = dict(zip(of, taken(trials, len(of)), strict=True))
+    trials = Trials(out)
+    columns = trials.columns()
+    names = ("object_name", "resting", "candidate", "standoff_index")
+    identity = list(zip(*(trials[name].tolist() for name in names), strict=True))
+    attempts = {key: taken(columns, i) for i, key in enumerate(identity)}
     samples = {}
     for camera, name in DATA_FILES.items():
-        with h5py.File(out / name) as file:
-            for split in SPLITS:
-                ids = file[split]["trial_id"][:].tolist()
-                for number, row in zip(ids, taken(file[split], len(ids)), strict=True):
-                    samples[camera, identity[number]] = split, row
+        for split in SPLITS:
+            data = GraspDataset(out / name, split=split)
+            own = {field: data.column(field) for field in FIELDS}
+            for i, trial in enumerate(data.column("trial_id").tolist()):
+                samples[camera, identity[trial]] = split, taken(own, i)
     return attempts, samples
 
 

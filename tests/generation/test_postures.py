@@ -9,7 +9,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.assertions import assert_same_arrays
 from helpers.builds import build
 from helpers.hands import write_with_preshapes
 from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
@@ -109,14 +108,6 @@ def test_each_row_is_an_attempt_with_its_outcome(dataset):
 @pytest.mark.parametrize("row", range(4))
 def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
     assert replay_trial(dataset, row).same
-
-
-@pytest.mark.nightly
-def test_more_rows_complete_the_dataset_of_fewer(meshes, table, dataset, tmp_path):
-    fewer = load_config(overrides=[*QUICK, "candidates.max=2"])
-    out = built(meshes, tmp_path / "out", table, fewer)
-    assert len(Trials(out)) == 2
-    assert_same_arrays(built(meshes, out, table) / "trials.hdf5", dataset / "trials.hdf5")
 
 
 def test_dataset_of_other_postures_is_not_continued(meshes, table, dataset, tmp_path):

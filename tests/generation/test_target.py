@@ -177,17 +177,6 @@ def test_target_that_cannot_be_met_is_told() -> None:
     assert target.warnings()[0] == "443 of 1,000 samples were found"
 
 
-def test_object_without_more_drawn_palms_is_dry_until_more_are_drawn() -> None:
-    target = Target(load_config(samples=6), {"poor": 0})
-    target.set_units("poor", units("poor", 12), endless=True)
-    for unit in target.next_units():
-        end(target, unit)
-    assert target.dry() == ["poor"]
-    target.set_units("poor", units("poor", PALMS), endless=True)
-    assert target.dry() == []
-    assert run(target) == {"poor": 56}
-
-
 def test_samples_that_the_filter_of_outliers_removes_are_made_up_for() -> None:
     target = make_target(samples=12)
     run(target)

@@ -89,12 +89,6 @@ def test_a_difference_is_paired_by_object():
     )
 
 
-def test_training_seeds_widen_the_interval():
-    good, bad = [["kept"]] * 3, [["fails"]] * 3
-    one = estimated(judged("net", good, bad), 0, 1, 2)["headline"]
-    assert (one["value"], one["low"], one["high"]) == (0.5, 0.0, 1.0)
-
-
 def test_training_seeds_of_both_sets_widen_a_difference():
     """Drawn apart: the better seeds of one may meet the worse of the other."""
     good, bad = [["kept"]] * 3, [["fails"]] * 3
