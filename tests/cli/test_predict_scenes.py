@@ -139,18 +139,8 @@ def test_an_arm_is_asked_for_the_grasps_of_scenes(
 @pytest.mark.slow
 @pytest.mark.nightly
 def test_grasps_of_scenes_are_scored(scenes: Path, predicted: Path, tmp_path: Path) -> None:
-    given = (
-        "--dataset",
-        scenes,
-        "--split",
-        "train",
-        "--reference",
-        "own",
-        "--out",
-        tmp_path / "card",
-        "--quiet",
-    )
-    result = run("score", predicted, *given, "--workers", 1)
+    given = ("--dataset", scenes, "--split", "train", "--reference", "own", "--quiet")
+    result = run("score", predicted, *given, "--out", tmp_path / "card", "--workers", 1)
     assert result.exit_code == 0, result.output
     assert float(result.stdout.split()[1]) > 50.0
 

@@ -50,11 +50,8 @@ RULES = (
 OBJECTS = ("objects.resting_poses=8", "seed=6", "objects.mass=0.1", "physics.friction_hand=0.8")
 #: Every success is a sample.
 SAMPLES = (
-    "filters.require=lifted",
-    "filters.outlier_sigma=0",
-    "filters.min_depth_variance=0",
-    "filters.min_camera_height=-1",
-    "filters.max_surface_distance=1",
+    *("filters.require=lifted", "filters.outlier_sigma=0", "filters.min_depth_variance=0"),
+    *("filters.min_camera_height=-1", "filters.max_surface_distance=1"),
     "filters.max_normal_angle_deg=null",
 )
 

@@ -23,22 +23,12 @@ from drakegrasp.simulation.attempts import GraspTable
 #: Six units of half a second for each object, so that none goes with another and a build can be
 #: stopped in time; of six attempts one succeeds.
 FAST = [
-    "screen.mode=off",
-    "candidates.max=6",
-    "candidates.global_x_deg=[0]",
-    "candidates.global_y_deg=[0]",
-    "candidates.global_z_deg=[0,45,90]",
-    "candidates.local_z_deg=[0,90]",
-    "unit_candidates=1",
-    "settle.drop_height=0.01",
-    "settle.max_linear_speed=0.1",
-    "settle.max_angular_speed=1",
-    "physics.time_step=0.006",
-    "lift.max_speed=2",
-    "lift.max_acceleration=20",
-    "lift.hold_time=0.1",
-    "camera.size=32",
-    "filters.outlier_sigma=0",
+    *("screen.mode=off", "candidates.max=6", "unit_candidates=1"),
+    *("candidates.global_x_deg=[0]", "candidates.global_y_deg=[0]"),
+    *("candidates.global_z_deg=[0,45,90]", "candidates.local_z_deg=[0,90]"),
+    *("settle.drop_height=0.01", "settle.max_linear_speed=0.1", "settle.max_angular_speed=1"),
+    *("physics.time_step=0.006", "lift.max_speed=2", "lift.max_acceleration=20"),
+    *("lift.hold_time=0.1", "camera.size=32", "filters.outlier_sigma=0"),
 ]
 
 
