@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from drakegrasp.simulation.attempts import make_posture
     from drakegrasp.simulation.placement import PlacedObject, place_object, run_trial
     from drakegrasp.simulation.posture import Posture
+    from drakegrasp.verification.clutter import Clutter, load_scene
     from drakegrasp.verification.result import PoseTrial, Verification
     from drakegrasp.vision.depth_image import cloud_from_depth, fit_table
 
@@ -58,6 +59,7 @@ _HOMES = {
     "Arm": "reach.arm",
     "BlankImageError": "errors",
     "BuildReport": "generation.pipeline",
+    "Clutter": "verification.clutter",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",
@@ -90,6 +92,7 @@ _HOMES = {
     "load_arm": "reach.arm",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
+    "load_scene": "verification.clutter",
     "make_benchmark": "api.building",
     "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",
@@ -111,6 +114,7 @@ __all__ = [
     "Arm",
     "BlankImageError",
     "BuildReport",
+    "Clutter",
     "Config",
     "ConfigError",
     "DataError",
@@ -143,6 +147,7 @@ __all__ = [
     "load_arm",
     "load_config",
     "load_hand",
+    "load_scene",
     "make_benchmark",
     "make_posture",
     "pack_grasp",

@@ -33,6 +33,7 @@ from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, count_workers, processes, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.placement import PlacedObject, place_object
+from drakegrasp.verification.clutter import Clutter
 from drakegrasp.verification.placing import (
     PlacedGrasp,
     contacts_on_object,
@@ -49,8 +50,9 @@ if TYPE_CHECKING:
 
 #: Source of an object on the table: a mesh file, a mesh, or a placed object.
 ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | PlacedObject
-#: Target of a grasp: an object, or a sample or dataset that defines the object of each grasp.
-GraspTarget: TypeAlias = ObjectMesh | Sample | GraspDataset
+#: Target of a grasp: an object, a scene, or a sample or dataset that defines the object of each
+#: grasp.
+GraspTarget: TypeAlias = ObjectMesh | Clutter | Sample | GraspDataset
 
 #: Receives verdicts as they are computed: called with the place of a grasp in the sequence, its
 #: verdict, and what the trials share.
@@ -68,6 +70,7 @@ def verify_grasp(
     on: GraspTarget,
     *,
     row: int | None = None,
+    object: int | str | None = None,
     frame: str | None = None,
     X_TC: npt.ArrayLike | None = None,
     units: str | None = None,
@@ -87,6 +90,7 @@ def verify_grasp(
             a tensor of torch.
         on: Target of the grasp, see `verify_grasps`.
         row: The grasp's row, if `on` is a `GraspDataset`.
+        object: The grasped object, if `on` is a scene of `load_scene`.
         frame: Frame of the grasp: "object", "table", "camera", "world" or "mesh". See
             `verify_grasps` for details of this and the following arguments.
         X_TC: With frame "camera" on an object: pose (4, 4) of the camera in {T}.
@@ -117,6 +121,7 @@ def verify_grasp(
         grasp,
         on,
         rows=rows,
+        object=object,
         frame=frame,
         X_TC=X_TC,
         units=units,
@@ -141,6 +146,7 @@ def verify_grasps(
     on: GraspTarget,
     *,
     rows: Sequence[int] | None = None,
+    object: int | str | None = None,
     frame: str | None = None,
     X_TC: npt.ArrayLike | None = None,
     units: str | None = None,
@@ -157,6 +163,7 @@ def verify_grasps(
     |---|---|---|---|
     | path of a mesh, `trimesh.Trimesh` | this object, dropped on the table | object | of `config` |
     | `PlacedObject` | this object in its pose | object | as given to `place_object` |
+    | scene of `load_scene` | `object`, among its neighbours | object | of `config` |
     | `Sample` | the object and pose of its row, for all grasps | camera | drawn for its row |
     | `GraspDataset` | the objects and poses of `rows` | camera | drawn for each row |
 
@@ -166,6 +173,8 @@ def verify_grasps(
         on: Target of the grasps, see the table.
         rows: Only for a `GraspDataset`: row of its split for each grasp; None for all rows, in
             order.
+        object: Only for a scene of `load_scene`: the grasped object, by its index in the scene, or
+            by its name if that is there once.
         frame: Frame of the grasps: "object" {O}, whose origin is the centre of the bounding box;
             "camera" {C}; "table" {T}, at the centre of the table top; "world" {W}; or "mesh" {M},
             with the axes and origin of the mesh file. None for the default.
@@ -193,6 +202,16 @@ def verify_grasps(
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
+    if isinstance(on, Clutter):
+        if object is None:
+            raise GraspError(f"object must be given with a scene, {on}, got None")
+        if arm is not None:
+            raise GraspError(
+                f"arm must be None on a scene, got {arm.name}"
+            )
+        on = on.placed(object)
+    elif object is not None:
+        raise GraspError(f"object must be given with a scene only, got {object!r}")
     if isinstance(on, Sample | GraspDataset):
         _validate_none(on, X_TC=X_TC, units=units, X_TO=X_TO)
         if isinstance(on, Sample) and rows is not None:
@@ -225,8 +244,8 @@ def _validate_none(on: Sample | GraspDataset, **given: object) -> None:
 def _validate_target(on: object) -> None:
     if not isinstance(on, str | Path | trimesh.Trimesh | PlacedObject):
         raise GraspError(
-            "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a Sample or a "
-            f"GraspDataset, got a {type(on).__name__}"
+            "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a scene, a Sample "
+            f"or a GraspDataset, got a {type(on).__name__}"
         )
     if isinstance(on, str | Path) and Path(on).suffix.lower() in HDF5_SUFFIXES:
         raise GraspError(

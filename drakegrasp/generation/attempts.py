@@ -16,18 +16,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drakegrasp.arithmetic import multiply
+from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
-from drakegrasp.dataset.schema import CAMERAS, NO_PRESHAPE, sizes
+from drakegrasp.dataset.schema import CAMERAS, MOVED_SHIFT, MOVED_TURN, NO_PRESHAPE, sizes
 from drakegrasp.dataset.shards import ShardHeader, trial_columns
 from drakegrasp.dataset.successes import successes_of
 from drakegrasp.errors import DataError
 from drakegrasp.filters import FILTERS, Removal
-from drakegrasp.frames import Array, pack_pose
+from drakegrasp.frames import Array, pack_pose, rotation_angle
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ContactFit, ObjectModel, fit_contacts
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt, Conditions, draw_conditions, usual_conditions
 from drakegrasp.simulation.attempts import posture_attempts
@@ -312,6 +313,40 @@ def judge_sample(
         for name, pose in _CAMERA_POSES.items():
             columns[f"X_TC_{name}"] = pack_pose(pose(X_TG, config.camera))[None]
     return Removal(int(successes_of(Table(columns), config)["by_filter"][0]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbance:
+    """What a trial did to the neighbours of the grasped object, from its start to its end.
+
+    Attributes:
+        neighbour: Index of the neighbour that was shifted most.
+        shift: Largest shift of a neighbour's origin [m].
+        turn: Largest turn of a neighbour [rad].
+    """
+
+    neighbour: int
+    shift: float
+    turn: float
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the neighbours count as left in place."""
+        return self.shift <= MOVED_SHIFT and self.turn <= MOVED_TURN
+
+
+def disturbance_of(trial: TrialRecord, around: Neighbourhood | None) -> Disturbance | None:
+    """Return what a trial did to the neighbours, None without any or if the hand did not close."""
+    end = trial.lift or trial.closed
+    if end is None or around is None or not around.models:
+        return None
+    shift = norm(end.X_TN[:, :3, 3] - around.X_TN[:, :3, 3])
+    turned = multiply(np.swapaxes(around.X_TN[:, :3, :3], 1, 2), end.X_TN[:, :3, :3])
+    return Disturbance(
+        neighbour=int(np.argmax(shift)),
+        shift=float(shift.max()),
+        turn=max(rotation_angle(R) for R in turned),
+    )
 
 
 #: Columns of the filters that need the images of a success.

@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from drakegrasp.arithmetic import Array, multiply, norm
+from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.paths import clutter_path, object_files
@@ -24,8 +24,6 @@ from drakegrasp.dataset.schema import (
     DEPTH_UNIT,
     HITS_NOTHING,
     HITS_TABLE,
-    MOVED_SHIFT,
-    MOVED_TURN,
     NO_OBJECT,
     NOT_TRIED,
     VIEW_FIELDS,
@@ -33,8 +31,8 @@ from drakegrasp.dataset.schema import (
 )
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
-from drakegrasp.frames import invert_pose, pack_pose, rotation_angle
-from drakegrasp.generation.attempts import find_attempt, judge_sample
+from drakegrasp.frames import invert_pose, pack_pose
+from drakegrasp.generation.attempts import disturbance_of, find_attempt, judge_sample
 from drakegrasp.generation.directory import DatasetTask
 from drakegrasp.generation.scenes import (
     Columns,
@@ -204,12 +202,7 @@ class _Scene:
 
     def _around(self, i: int, X: Array | None = None) -> Neighbourhood:
         """Return what is around object i, moved by a pose."""
-        others = [j for j in range(len(self._models)) if j != i]
-        around = Neighbourhood(
-            models=tuple(self._models[j] for j in others),
-            X_TN=self._X_TN[others],
-            boxes=self._task.surroundings.boxes,
-        )
+        around = Neighbourhood.of(i, self._models, self._X_TN, self._task.surroundings.boxes)
         return around if X is None else around.moved(X)
 
     # Views
@@ -396,7 +389,7 @@ def labels_of(
         others: Indices of the neighbours in the scene.
         config: The rules.
     """
-    outcome, end = record.outcome, record.lift or record.closed
+    outcome, moved = record.outcome, disturbance_of(record, around)
     labels = {
         "outcome": outcome,
         "tested": outcome in TRIED and record.lift is not None,
@@ -405,17 +398,11 @@ def labels_of(
         "precision": record.precision,
         "stable": record.stable,
     }
-    if end is None or not len(others):
+    if moved is None:
         return labels | {"clean": labels["kept"]}
-
-    # The motion of each neighbour from the start to the end of the trial.
-    shift = norm(end.X_TN[:, :3, 3] - around.X_TN[:, :3, 3])
-    turned = multiply(np.swapaxes(around.X_TN[:, :3, :3], 1, 2), end.X_TN[:, :3, :3])
-    turn = np.array([rotation_angle(R) for R in turned])
-    left = bool(shift.max() <= MOVED_SHIFT and turn.max() <= MOVED_TURN)
     return labels | {
-        "clean": labels["kept"] and left,
-        "neighbour": others[int(np.argmax(shift))],
-        "neighbour_shift": float(shift.max()),
-        "neighbour_turn": float(turn.max()),
+        "clean": labels["kept"] and moved.is_small,
+        "neighbour": others[moved.neighbour],
+        "neighbour_shift": moved.shift,
+        "neighbour_turn": moved.turn,
     }

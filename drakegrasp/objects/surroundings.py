@@ -13,7 +13,7 @@ All poses are in the table-top frame {T}. The table itself is always there.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -93,6 +93,21 @@ class Neighbourhood:
     models: tuple[ObjectModel, ...] = ()
     X_TN: Array
     boxes: tuple[Box, ...] = ()
+
+    @classmethod
+    def of(
+        cls, i: int, models: Sequence[ObjectModel], X_TN: Array, boxes: tuple[Box, ...]
+    ) -> Neighbourhood:
+        """Return what is around object i of a scene.
+
+        Args:
+            i: Index of the object.
+            models: All objects of the scene.
+            X_TN: Their poses, (o, 4, 4).
+            boxes: The boxes.
+        """
+        others = [j for j in range(len(models)) if j != i]
+        return cls(models=tuple(models[j] for j in others), X_TN=X_TN[others], boxes=boxes)
 
     def __bool__(self) -> bool:
         return bool(self.models or self.boxes)

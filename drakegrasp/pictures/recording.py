@@ -24,6 +24,7 @@ from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.pictures.style import PREDICTED, SEEN_THROUGH, STILL
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import write_atomic
@@ -63,6 +64,7 @@ def record_attempt(
     p_OQ: Array | None = None,
     nhat_Q_O: Array | None = None,
     caption: str = "",
+    around: Neighbourhood | None = None,
     still: Mapping[str, Array] | None = None,
 ) -> TrialRecord:
     """Return the result of `trial.run_attempt`, and write a recording of the attempt.
@@ -76,6 +78,7 @@ def record_attempt(
         p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
         nhat_Q_O: (k, 3), outward unit normals of the contacts in {O}.
         caption: Text in a corner.
+        around: What is around the object, see `build_scene`.
         still: What else to draw, by name: triangles (t, 3, 3) in {W} [m], of which the first are
             solid and the others can be seen through.
 
@@ -85,7 +88,7 @@ def record_attempt(
 
     def run(meshcat: Meshcat) -> TrialRecord:
         hand = load_hand(config.hand_source).at(attempt.preshape)
-        scene = build_scene(model, config.physics, hand, meshcat=meshcat)
+        scene = build_scene(model, config.physics, hand, meshcat=meshcat, around=around)
         # An attempt that fails before it is simulated is shown at its start.
         X_WO = X_WT @ np.asarray(X_TO, dtype=float)
         q = None if attempt.path is None else attempt.path[0]

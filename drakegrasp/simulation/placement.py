@@ -8,7 +8,7 @@ the table and how it is turned about the vertical.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -50,17 +50,20 @@ class PlacedObject:
         config: The configuration with which the object was prepared and dropped; by default that
             of `load_config()`.
         around: Neighbours and walls around it; None if it is alone on the table.
+        X_TO_rest: Resting pose (4, 4) from which X_TO differs only by yaw, a shift and rounding;
+            None if it is not known.
     """
 
     model: ObjectModel
     X_TO: Array
     config: Config = field(default_factory=load_config)
     around: Neighbourhood | None = None
+    X_TO_rest: Array | None = None
 
     @cached_property
     def X_TO_simulated(self) -> Array:
         """Pose (4, 4) moved to the table's centre, without yaw; verdicts depend on neither."""
-        return canonical_pose(self.X_TO)
+        return canonical_pose(self.X_TO if self.X_TO_rest is None else self.X_TO_rest)
 
     @property
     def around_simulated(self) -> Neighbourhood | None:
@@ -98,7 +101,8 @@ def place_object(
 
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
-        GraspError: If X_TO is not a pose or does not put the object on the table.
+        GraspError: If X_TO is not a pose or does not put the object on the table, or the object is
+            among others.
         ConfigError: If config is not a `Config`, or the object was placed with other values.
         HandError: If the hand cannot be used.
     """
@@ -113,7 +117,11 @@ def place_object(
         if units is not None:
             raise MeshError(f"units must be None for a prepared object, got {units!r}")
         validate_same_objects(config, mesh.config, "as the object was placed with")
-        model, known = mesh.model, np.asarray(mesh.X_TO)
+        if X_TO is None:
+            return replace(mesh, config=config)
+        if mesh.around is not None:
+            raise GraspError("X_TO must be None for an object among others, got a pose")
+        model, known = mesh.model, None
     elif isinstance(mesh, trimesh.Trimesh):
         model, known = _model_of(mesh, units or "m", config), None
     elif isinstance(mesh, str | Path):

@@ -26,7 +26,7 @@ from drakegrasp.dataset.reader import PredictedRows
 from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.filters import Removal
 from drakegrasp.frames import X_WT, Array, invert_pose, pack_pose, transform_points
-from drakegrasp.generation.attempts import unjudged
+from drakegrasp.generation.attempts import Disturbance, disturbance_of, unjudged
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.reach.arm import Arm
@@ -165,8 +165,24 @@ class Verification:
 
     @property
     def kept(self) -> bool:
-        """Whether the grasp passes the filters of a dataset, except for those in `unjudged`."""
+        """Whether the grasp passes the filters of a dataset, except for those in `unjudged`.
+
+        Among other objects the filters of camera poses are not applied, either.
+        """
         return self.removal is Removal.KEPT
+
+    @property
+    def clean(self) -> bool:
+        """Whether it is kept and left its neighbours in place: within 10 mm and 10 degrees."""
+        return self.kept and (self.disturbance is None or self.disturbance.is_small)
+
+    @property
+    def disturbance(self) -> Disturbance | None:
+        """What the first trial did to the neighbours, which are those of `placed.around`.
+
+        None for an object without neighbours, and for a hand that did not close.
+        """
+        return disturbance_of(self.trial, self.placed.around_simulated) if self.trial else None
 
     @property
     def removal(self) -> Removal | None:
@@ -312,6 +328,7 @@ class Verification:
             p_OQ=self.p_OQ,
             nhat_Q_O=self.nhat_Q_O,
             caption=self.explain(),
+            around=self.placed.around_simulated,
             still=self._arm_in_world(),
         )
 
@@ -363,6 +380,8 @@ def _sentences(verified: Verification) -> Iterator[str]:
         yield _other_poses(verified)
     if verified.trial is not None and verified.trial.lift is not None:
         yield _in_the_hand(verified, verified.trial.lift)
+    if verified.disturbance is not None:
+        yield _among_others(verified, verified.disturbance)
     if verified.misplaced:
         return
     if verified.removal is not None:
@@ -375,6 +394,15 @@ def _sentences(verified: Verification) -> Iterator[str]:
     # Other possible faults in the numbers.
     if verified.hints:
         yield better
+
+
+def _among_others(verified: Verification, moved: Disturbance) -> str:
+    assert verified.placed.around is not None
+    name = verified.placed.around.models[moved.neighbour].name
+    return (
+        f"Of its neighbours {name} is shifted most, by {in_mm(moved.shift)}; the largest turn of a "
+        f"neighbour is {np.rad2deg(moved.turn):.1f}°."
+    )
 
 
 def _by_the_arm(reach: Reach) -> str:

@@ -125,13 +125,14 @@ def _try(grasp: PlacedGrasp, p_OQ: Array, nhat_Q_O: Array, fit: WristFit) -> Pos
         contact_error = np.linalg.norm(closed.p_OQ - p_OQ, axis=1)
         cosine = np.sum(closed.nhat_Q_O * nhat_Q_O, axis=1)
         normal_error = np.arccos(np.clip(cosine, -1.0, 1.0))
+    views = grasp.placed.around is None  # the cameras of a build see one object
     return PoseTrial(
         fit=fit,
         pregrasp=pregrasp,
         trial=trial,
         contact_error=contact_error,
         normal_error=normal_error,
-        removal=judge_sample(grasp.placed.model, trial, grasp.config),
+        removal=judge_sample(grasp.placed.model, trial, grasp.config, views=views),
     )
 
 
