@@ -206,9 +206,7 @@ def verify_grasps(
         if object is None:
             raise GraspError(f"object must be given with a scene, {on}, got None")
         if arm is not None:
-            raise GraspError(
-                f"arm must be None on a scene, got {arm.name}"
-            )
+            raise GraspError(f"arm must be None on a scene, got {arm.name}")
         on = on.placed(object)
     elif object is not None:
         raise GraspError(f"object must be given with a scene only, got {object!r}")
