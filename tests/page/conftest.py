@@ -1,4 +1,4 @@
-"""A small dataset of boxes, and the application that shows it."""
+"""The application that shows the dataset of boxes, also with names that are scripts."""
 
 from __future__ import annotations
 

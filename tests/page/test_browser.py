@@ -342,6 +342,37 @@ def test_scenes_filter_and_open(page: Page, out: Path) -> None:
         wait_for_cards(page, of_test)
 
 
+#: The smallest contrast of a text to what is behind it, with that text. Disabled things and text in
+#: pictures are not counted.
+CONTRAST = """() => {
+  const numbers = (text) => text.match(/[0-9.]+/g).map(Number);
+  const linear = (x) => x <= 0.03928 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) =>
+    0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+  const behind = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const colour = numbers(getComputedStyle(e).backgroundColor);
+      if (colour.length === 3 || colour[3] === 1) return colour;
+    }
+    return [255, 255, 255];
+  };
+  let worst = [99, ""];
+  const judge = (element, text, part) => {
+    const colour = numbers(getComputedStyle(element, part).color);
+    const [a, b] = [light(colour), light(behind(element))].sort((x, y) => y - x);
+    if ((a + 0.05) / (b + 0.05) < worst[0]) worst = [(a + 0.05) / (b + 0.05), text];
+  };
+  for (const element of document.querySelectorAll("body *")) {
+    if (!element.checkVisibility() || element.closest("svg") || element.disabled) continue;
+    const texts = [...element.childNodes].filter((node) => node.nodeType === 3);
+    const own = texts.map((node) => node.textContent.trim()).join("");
+    if (own || element.tagName === "SELECT") judge(element, own || element.name);
+    if (element.placeholder) judge(element, element.placeholder, "::placeholder");
+  }
+  return worst;
+}"""
+
+
 @pytest.mark.sim
 def test_scenes_of_several_objects_open(page: Page, out: Path) -> None:
     around = [load_surroundings("bin")]

@@ -34,9 +34,9 @@ def label(file: h5py.File, row: int, **labels: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def made(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset with scenes of two and three objects, and labels of all kinds. Read only."""
-    out = Path(shutil.copytree(boxes, tmp_path_factory.mktemp("clutter") / "boxes"))
+    out = Path(shutil.copytree(sound, tmp_path_factory.mktemp("clutter") / "boxes"))
     around = [load_surroundings(name) for name in ("bin", "table")]
     make_clutter(out, ClutterRequest(scenes=4, objects=(2, 3), surroundings=around, tries=0))
     with h5py.File(out / CLUTTER, "r+") as file:
@@ -199,6 +199,6 @@ def test_file_that_cannot_be_shown_is_a_line(
     assert answer.status_code == 400 and line in Tags(answer.text).text
 
 
-def test_without_the_file_the_page_says_what_makes_it(boxes: Path) -> None:
-    answer = open_pages(boxes).get("/clutter")
+def test_without_the_file_the_page_says_what_makes_it(sound: Path) -> None:
+    answer = open_pages(sound).get("/clutter")
     assert answer.status_code == 404 and "drakegrasp clutter makes them" in answer.text
