@@ -251,6 +251,8 @@ def figures(
         sheet          colour, depth and mask of samples of all objects in turn
         outcomes       how the attempts ended: samples, removed, failed
         distributions  slip, turn, forces of the samples
+        clutter        how many grasps are free, kept and clean among other objects
+        scenes         colour and masks of scenes of several objects
 
     Args:
         out: Directory of the dataset.

@@ -17,11 +17,12 @@ from drakegrasp.dataset.reach import count_reach
 from drakegrasp.dataset.statistics import (
     Funnel,
     SplitCount,
+    count_clutter,
     count_funnel,
     count_splits,
     lifted_note,
 )
-from drakegrasp.errors import counted, printable
+from drakegrasp.errors import DataError, counted, printable
 from drakegrasp.filters import Removal
 from drakegrasp.grasp import BANDS
 from drakegrasp.outcomes import GROUPS, Outcome
@@ -154,3 +155,9 @@ def print_stats(out: Path) -> None:
         say(line)
     for count in count_reach(out):
         say(escape(count.explain()))
+    # A file of scenes may be older than the other files.
+    try:
+        for among in count_clutter(out):
+            say(escape(among.explain()))
+    except DataError as error:
+        say(escape(f"not counted: {error}"))

@@ -1,4 +1,4 @@
-"""Counts of a dataset: the funnel by object, and the paper's Table III."""
+"""Counts of a dataset: the funnel by object, the paper's Table III, and grasps among others."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.assemble import validate_assembled
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.dataset.paths import CLUTTER_FILE, TRIALS_FILE
 from drakegrasp.dataset.reach import count_reach
-from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.scenes import SceneDataset, validate_state
+from drakegrasp.dataset.schema import NOT_TRIED, SPLITS
 from drakegrasp.dataset.trials import NONE, Trials
-from drakegrasp.errors import counted
+from drakegrasp.errors import counted, printable
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.grasp import BANDS, approach_cells, distinct_grasps, elevation_bands
@@ -184,6 +185,66 @@ def count_splits(out: Path) -> list[SplitCount]:
     return counts
 
 
+@dataclass(frozen=True, kw_only=True)
+class ClutterCount:
+    """Numbers of grasps in scenes of several objects with the same surroundings.
+
+    Attributes:
+        surroundings: Their name.
+        scenes: Number of scenes.
+        grasps: All grasps.
+        free: Grasps whose way is free by geometry.
+        tried: Free grasps that were tried in simulation.
+        kept, clean: Tried grasps with these labels.
+        neighbour_hit: Tried grasps with this outcome.
+    """
+
+    surroundings: str
+    scenes: int
+    grasps: int
+    free: int
+    tried: int
+    kept: int
+    clean: int
+    neighbour_hit: int
+
+    def explain(self) -> str:
+        """Return how many grasps are free, and how the tried ones ended."""
+        free = f"{self.free:,} of {counted(self.grasps, 'grasp')} free"
+        if self.grasps:
+            free += f" ({self.free / self.grasps:.0%})"
+        tried = f"{self.kept:,} kept, {self.clean:,} clean, {self.neighbour_hit:,} hit a neighbour"
+        where = f"{counted(self.scenes, 'scene')} of several objects ({self.surroundings})"
+        return printable(f"{where}: {free}; of {self.tried:,} tried {tried}")
+
+
+def count_clutter(out: Path) -> list[ClutterCount]:
+    """Return the counts of clutter.hdf5 by surroundings; empty if there is no such file.
+
+    Raises:
+        DataError: If the file is damaged, or was made from other trials.
+    """
+    path = out / CLUTTER_FILE
+    if not os.path.lexists(path):
+        return []
+    validate_state(path, Trials(out))
+    tables = SceneDataset(path, points=None).tables
+    around, grasps = tables["scenes"]["surroundings"], tables["grasps"]
+    where, outcome = around[grasps["scene"]], grasps["outcome"]
+    labels = {name: grasps[name] for name in ("free", "kept", "clean")}
+    labels["tried"] = outcome != NOT_TRIED
+    labels["neighbour_hit"] = outcome == Outcome.NEIGHBOUR_HIT
+    return [
+        ClutterCount(
+            surroundings=name,
+            scenes=int((around == name).sum()),
+            grasps=int((where == name).sum()),
+            **{key: int((has & (where == name)).sum()) for key, has in labels.items()},
+        )
+        for name in sorted(set(around))
+    ]
+
+
 def counts_as_dict(out: Path) -> dict[str, Any]:
     """Return the counts of a dataset as JSON types; labels without a count are left out.
 
@@ -226,4 +287,6 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     # Most datasets have no files of arms.
     if counts := count_reach(out):
         found["reach"] = [count.as_dict() for count in counts]
+    if among := count_clutter(out):
+        found["clutter"] = [asdict(count) for count in among]
     return found

@@ -34,7 +34,7 @@ from drakegrasp.page.renders import (
     make_scene,
 )
 from drakegrasp.page.snapshot import Snapshot
-from drakegrasp.pictures.style import INSTANCE_COLOURS, REACHED, TRUE, colour_png, instances_png
+from drakegrasp.pictures.style import INSTANCE_COLOURS, REACHED, TRUE, beside_instances, colour_png
 from drakegrasp.table import Table
 
 Rows = npt.NDArray[np.int64]
@@ -272,7 +272,7 @@ class Clutter(Scenes):
     def picture(self, view: int) -> bytes:
         """Return the colours of a view beside the masks of its objects, as a PNG."""
         colours, _, mask = self.data.stored_images(view)
-        return instances_png(colours, mask)
+        return colour_png(beside_instances(colours, mask))
 
     def _label(self, name: str) -> npt.NDArray[np.bool_]:
         grasps = self.data.tables["grasps"]

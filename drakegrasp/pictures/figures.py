@@ -7,10 +7,11 @@ bytes on the same machine.
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -22,11 +23,12 @@ from matplotlib.figure import Figure
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import DATA_FILES, reach_names
+from drakegrasp.dataset.paths import CLUTTER_FILE, DATA_FILES, reach_names
 from drakegrasp.dataset.reach import ReachCount, count_reach
 from drakegrasp.dataset.reader import GraspDataset, Sample
+from drakegrasp.dataset.scenes import SceneDataset, validate_state
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.dataset.statistics import Funnel, count_funnel
+from drakegrasp.dataset.statistics import ClutterCount, Funnel, count_clutter, count_funnel
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, counted
 from drakegrasp.filters import Removal
@@ -37,9 +39,11 @@ from drakegrasp.pictures.charts import draw_counts, draw_distributions, draw_par
 from drakegrasp.pictures.style import (
     INK,
     add_axes,
+    beside_instances,
     draw_colour_bar,
     draw_finger_legend,
     draw_sample,
+    hide_ticks,
     png_bytes,
     read_far,
     svg_bytes,
@@ -114,8 +118,12 @@ def write_figures(out: Path, folder: Path, *, progress: Report = silent) -> Writ
         "outcomes": lambda: _outcomes(funnel),
         "distributions": lambda: _distributions(samples, funnel),
     }
-    if reach_names(out):  # most datasets have no files of arms
+    # Most datasets have no files of arms, and no scenes of several objects.
+    if reach_names(out):
         drawings["reach"] = lambda: _reach(count_reach(out))
+    if os.path.lexists(out / CLUTTER_FILE):
+        drawings["clutter"] = lambda: _clutter(count_clutter(out))
+        drawings["scenes"] = lambda: _scenes(out)
 
     # A figure is drawn if there are data.
     written, numbers = Written(folder=folder), {}
@@ -131,7 +139,7 @@ def write_figures(out: Path, folder: Path, *, progress: Report = silent) -> Writ
         progress(done, len(drawings))
 
     # Delete figures of an earlier run that this run did not draw.
-    for name in {*drawings, "reach"}.difference(written.names):
+    for name in {*drawings, "reach", "clutter", "scenes"}.difference(written.names):
         for suffix in (".png", ".svg"):
             (folder / f"{name}{suffix}").unlink(missing_ok=True)
     text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)
@@ -238,10 +246,48 @@ def _reach(counts: Sequence[ReachCount]) -> Drawn:
     return figure, [count.as_dict() for count in counts]
 
 
+def _clutter(counts: Sequence[ClutterCount]) -> Drawn:
+    def parts(count: ClutterCount) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        ends = np.array([count.free, count.kept, count.clean, count.neighbour_hit])
+        return ends, np.array([count.grasps, *[count.tried] * 3])
+
+    figure = draw_parts(
+        {count.surroundings: parts(count) for count in counts},
+        ["free,\nof all grasps", "kept,\nof tried", "clean,\nof tried", "neighbour hit,\nof tried"],
+        title=f"grasps in {counted(sum(count.scenes for count in counts), 'scene')}",
+        what="by geometry, and by simulation of free grasps",
+    )
+    return figure, [asdict(count) for count in counts]
+
+
+def _scenes(out: Path) -> Drawn:
+    """Draw scenes of several objects, evenly spaced: colours beside the masks of the objects."""
+    validate_state(out / CLUTTER_FILE, Trials(out))
+    data = SceneDataset(out / CLUTTER_FILE, points=None)
+    scenes, views = data.tables["scenes"], data.tables["views"]
+    count = len(scenes["split"])
+    chosen = np.unique(np.linspace(0, count - 1, min(count, SCENES)).round().astype(int))
+    across = min(ACROSS, len(chosen))
+    wide, high, gap = 3.2, 1.2, 0.25
+    lines = -(-len(chosen) // across)
+    size = across * (wide + gap) + gap, lines * (high + gap) + gap
+    figure = Figure(figsize=size, facecolor="white")
+    for place, scene in enumerate(chosen.tolist()):
+        line, column = divmod(place, across)
+        axes = add_axes(figure, gap + column * (wide + gap), gap + line * (high + gap), wide, high)
+        rgb, _, mask = data.stored_images(int(np.argmax(views["scene"] == scene)))
+        axes.imshow(beside_instances(rgb, mask), interpolation="nearest")
+        hide_ticks(axes)
+        write_beside(axes, 0.0, 1.05, f"scene {scene}: {scenes['surroundings'][scene]}", 7.0)
+    return figure, {"scenes": chosen.tolist()}
+
+
 # The sheet of samples.
 
 #: Samples per line of a sheet, and the edge of each of its images [inch].
 ACROSS, EDGE = 3, 1.12
+#: Number of scenes of several objects on their sheet.
+SCENES = 12
 #: Number of samples on the sheet of a dataset, and the most if it has more objects than that.
 PLACES, MOST = 24, 60
 

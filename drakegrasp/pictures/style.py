@@ -250,14 +250,16 @@ def strip_png(image: npt.NDArray[np.float32], mask: npt.NDArray[np.uint8], *, fa
     return colour_png(strip)
 
 
-def instances_png(colours: npt.NDArray[np.uint8], mask: npt.NDArray[np.uint8]) -> bytes:
-    """Return colours (h, w, 3) beside a mask (h, w) as a PNG, (h, 2 w) pixels.
+def beside_instances(
+    colours: npt.NDArray[np.uint8], mask: npt.NDArray[np.uint8]
+) -> npt.NDArray[np.uint8]:
+    """Return colours (h, w, 3) beside a mask (h, w), with opacity, (h, 2 w, 4).
 
     The mask has 1 + the index of the object, which is drawn in one of INSTANCE_COLOURS.
     """
     palette = np.vstack([NO_DEPTH, np.rint(255.0 * to_rgba_array(INSTANCE_COLOURS))])
     known = np.dstack([colours, np.full(mask.shape, 255, dtype=np.uint8)])
-    return colour_png(np.concatenate([known, palette[mask].astype(np.uint8)], axis=1))
+    return np.concatenate([known, palette[mask].astype(np.uint8)], axis=1)
 
 
 def colour_png(colours: npt.NDArray[np.uint8]) -> bytes:
