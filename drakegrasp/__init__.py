@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from drakegrasp.config import Config
     from drakegrasp.dataset.check import Violation, check_dataset
     from drakegrasp.dataset.reader import GraspDataset, Sample
-    from drakegrasp.dataset.scenes import SceneDataset
+    from drakegrasp.dataset.scenes import SceneDataset, SceneRows
     from drakegrasp.dataset.trials import Trials
     from drakegrasp.errors import (
         BlankImageError,
@@ -79,6 +79,7 @@ _HOMES = {
     "Replay": "generation.replay",
     "Sample": "dataset.reader",
     "SceneDataset": "dataset.scenes",
+    "SceneRows": "dataset.scenes",
     "Score": "scoring.run",
     "Trials": "dataset.trials",
     "Verification": "verification.result",
@@ -134,6 +135,7 @@ __all__ = [
     "Replay",
     "Sample",
     "SceneDataset",
+    "SceneRows",
     "Score",
     "Trials",
     "Verification",

@@ -14,6 +14,7 @@ from drakegrasp.api.verifying import run_verification, verify_by_protocol
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.scenes import SceneRows
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.protocols.postures import describe, versions
 from drakegrasp.protocols.protocol import Lift, Protocol, find_protocol
@@ -100,6 +101,11 @@ def score(
     config = dataset_config(dataset, overrides=overrides)
     rule, stored = find_protocol(protocol)
     in_mujoco = not isinstance(rule, Lift)
+    if isinstance(dataset, SceneRows) and dataset.several:
+        if in_mujoco:
+            raise ConfigError(f"protocol must be lift for scenes of several objects, got {stored}")
+        if arm is not None:
+            raise ConfigError(f"arm must be None for scenes of several objects, got {arm.name}")
     if in_mujoco and arm is not None:
         raise ConfigError(f"arm must be None with protocol {stored}, got {arm.name}")
     if in_mujoco and (client or workers.get("scheduler") or workers.get("scheduler_file")):

@@ -64,8 +64,8 @@ def score(
 
     Args:
         predictions: Files of one method.
-        dataset: The data file of the predicted rows or views: OUT/grasping_oto.hdf5, _otm, or
-            OUT/scenes.hdf5.
+        dataset: The data file of the predicted rows or views: OUT/grasping_oto.hdf5, _otm,
+            OUT/scenes.hdf5, or OUT/clutter.hdf5.
         split: Rows of the dataset.
         against: Predictions of another method for the same rows: the card contains the difference
             of the headlines. May be given several times, once per training run of that method.

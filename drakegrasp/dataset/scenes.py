@@ -141,6 +141,7 @@ class SceneDataset:
         image_size: Height and width of the images [px].
         near, far: Near and far planes of the cameras [m].
         several: Whether the file has scenes of several objects.
+        around: What was asked for in this file, with all surroundings (JSON); else empty.
         tables: Columns of /scenes, /views and /grasps by their names, for all splits; no images.
         epoch: Number of the epoch, on which all draws depend.
         emptiness: What is said of the split if it has no items.
@@ -202,7 +203,8 @@ class SceneDataset:
             self.joints = tuple(parse_json(file.attrs["joints"]))
             self.fingers = tuple(parse_json(file.attrs["fingers"]))
             self.near, self.far = float(file.attrs["near"]), float(file.attrs["far"])
-            self.several = "clutter" in file.attrs
+            self.around = str(file.attrs.get("clutter", ""))
+            self.several = bool(self.around)
         if objects is not None and (unknown := sorted(set(objects) - set(self.names))):
             raise DataError(f"objects must be of {self.path}, got {unknown[0]!r}")
         self._number()
@@ -571,7 +573,7 @@ _OWN = 4
 
 
 def open_rows(path: Path, *, split: str, fewer_fingers: bool = False) -> GraspDataset:
-    """Return a split of a data file or of scenes.hdf5, depending on the content of the file.
+    """Return a split of a data file or of a file of scenes, depending on the content of the file.
 
     Args:
         path: The file.
@@ -620,12 +622,17 @@ class SceneRows(GraspDataset):
     Everything is in the view's camera frame. Verdicts are for the object where it rested in its
     trials, so the camera (`frame_work2cam_view`) is turned and moved back with the object.
 
+    In scenes of several objects, a row has a grasp that is kept in its scene, and the object of
+    this grasp, which the view must show. Verdicts are for the object where it is in its scene.
+
     Args:
-        path: OUT/scenes.hdf5; OUT/trials.hdf5 must be in the same folder.
+        path: OUT/scenes.hdf5 or OUT/clutter.hdf5; OUT/trials.hdf5 must be in the same folder.
         split: `train`, `valid` or `test`.
 
     Attributes:
         views: (n,), rows of /views.
+        several: Whether the scenes have several objects.
+        scenes, places: (n,), rows of /scenes, and indices of the objects in them.
 
     Raises:
         DataError: If a file is missing or damaged, if the files belong to different states of the
@@ -639,17 +646,20 @@ class SceneRows(GraspDataset):
         self._data = data = SceneDataset(
             path, points=None, split=split, negatives="none", balance="view", grasps=1
         )
-        self.views, self.emptiness = data.views, data.emptiness
-        self._length = len(self.views)
-
-        # The own grasp of each view, and the trial of this grasp.
-        trials, ids = Trials(self.path.parent), np.zeros(self._length, dtype=np.int64)
+        self.emptiness, self.several = data.emptiness, data.several
+        trials, views = Trials(self.path.parent), data.tables["views"]
         validate_state(self.path, trials)
-        grasps = []
-        for i, view in enumerate(self.views.tolist()):
+
+        # The own grasp of each view that shows its object, and the trial of this grasp.
+        rows, grasps = list[tuple[int, int, int]](), list[Array]()
+        for view in data.views.tolist():
             own = data.grasp_of(view, Stream(0, _OWN, view))
-            ids[i] = own["trial_id"][0]
-            grasps.append(pack_grasp(own["p_AQ"][0], own["nhat_Q_A"][0]))
+            place = int(own["grasp_object"][0]) if data.several else 0
+            if not data.several or views["visible_share"][view, place] > 0.0:
+                rows.append((view, place, own["trial_id"][0]))
+                grasps.append(pack_grasp(own["p_AQ"][0], own["nhat_Q_A"][0]))
+        self.views, self.places, ids = np.array(rows, dtype=np.int64).reshape(-1, 3).T
+        self._length = len(self.views)
         validate_codes(self.path, "/grasps/trial_id", ids, len(trials))
         numbers = 6 * data.tables["grasps"]["p_TQ"].shape[1]
         packed = np.array(grasps, dtype=np.float32).reshape(-1, numbers)
@@ -659,36 +669,41 @@ class SceneRows(GraspDataset):
                 "out: commands need a hand whose preshapes close all fingers"
             )
 
-        views = data.tables["views"]
-        scene = views["scene"][self.views]
-        objects = data.tables["scenes"]["object"][scene, 0]
+        of = self.scenes, self.places = views["scene"][self.views], self.places
+        scenes = data.tables["scenes"]
+        objects = scenes["object"][of]
         needed = ("X_TO", "X_OG", "mass", "friction_hand", "friction_table")
         trial = trials[ids].columns(needed)
-        # The pose that the camera would have if the object had stayed where it rested.
-        X_TO = unpack_pose(trial["X_TO"])
-        X_OC = multiply(
-            invert_pose(unpack_pose(data.tables["scenes"]["X_TO"][scene, 0])),
-            unpack_pose(views["X_TC"][self.views]),
-        )
+        # An object alone counts as if it had stayed where it rested, and the camera with it.
+        stood, X_TC = unpack_pose(scenes["X_TO"][of]), unpack_pose(views["X_TC"][self.views])
+        X_TO, X_OC = unpack_pose(trial["X_TO"]), multiply(invert_pose(stood), X_TC)
+        conditions: Mapping[str, AnyArray] = trial
+        if data.several:
+            X_TO = stood
+            conditions = {name: scenes[name][of] for name in needed[2:]}
         self._columns: dict[str, npt.NDArray[Any]] = {
             "grasps": packed,
             "trial_id": ids,
-            "grasp_props/resting": data.tables["scenes"]["resting"][scene, 0],
+            "grasp_props/resting": scenes["resting"][of],
             "grasp_props/X_CG": pack_pose(multiply(invert_pose(X_OC), unpack_pose(trial["X_OG"]))),
             "object_props/object_name": np.array(data.names, dtype=object)[objects],
             "object_props/class_name": np.array(data.classes, dtype=object)[objects],
-            "object_props/work2mass": trial["mass"][:, None],
+            "object_props/work2mass": conditions["mass"][:, None],
             f"object_props/frame_work2cam_{CAMERA}": pack_pose(multiply(X_TO, X_OC)),
             "object_props/frame_world2work": np.tile(pack_pose(X_WT), (self._length, 1)),
             "object_props/frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
-            "conditions/friction_hand": trial["friction_hand"],
-            "conditions/friction_table": trial["friction_table"],
+            "conditions/friction_hand": conditions["friction_hand"],
+            "conditions/friction_table": conditions["friction_table"],
         }
 
         # All cameras share one lens.
         self.K = views["K"][0].reshape(3, 3)
         digest = hashlib.sha256(str(trials.attributes["signature"]).encode())
-        for values in (ids, self.views, views["X_TC"][self.views]):
+        told = [ids, self.views, views["X_TC"][self.views]]
+        if data.several:
+            told += [scenes["object"], scenes["X_TO"]]
+            digest.update(data.around.encode())
+        for values in told:
             digest.update(np.ascontiguousarray(values).tobytes())
         self.content = digest.hexdigest()
 
@@ -717,14 +732,14 @@ class SceneRows(GraspDataset):
             return self.column(name)[row]
         seen = self._data.images(int(self.views[row]))
         if name == "masks":
-            return (seen["mask"] > 0).astype(np.uint8)
+            return (seen["mask"] == self.places[row] + 1).astype(np.uint8)
         depth = np.where(seen["depth"] > 0.0, seen["depth"], np.float32(self._data.far))
         colour = np.moveaxis(seen["rgb"], 2, 0) / np.float32(255.0)
         return np.concatenate([colour, depth[None]])
 
 
 def validate_state(path: Path, trials: Trials) -> None:
-    """Raise an error if a scenes.hdf5 was made from other trials.
+    """Raise an error if a file of scenes was made from other trials.
 
     Raises:
         DataError: If it was made from other trials, or cannot be read.

@@ -19,6 +19,7 @@ from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.scenes import SceneRows
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import (
@@ -51,6 +52,7 @@ from drakegrasp.simulation.placement import (
 )
 from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.settle import find_resting_poses
+from drakegrasp.verification.clutter import load_scene
 from drakegrasp.verification.prediction import ContactRows, RowChoice, choose_rows, read_grasps
 
 #: Names of the frames of a dataset's cameras: the data file's own camera, and the other camera.
@@ -442,12 +444,28 @@ def _objects_of_rows(
     resting = dataset.column("grasp_props/resting")[rows].astype(np.int64)
     known = _drawn(dataset, rows) if drawn else np.full((len(rows), 3), np.nan)
     overridden, out = overridden_keys(overrides), dataset.path.parent
+    if isinstance(dataset, SceneRows) and dataset.several:
+        yield from _objects_in_scenes(dataset, rows, config, overridden)
+        return
     manifest = read_manifest(out)
     for name in dict.fromkeys(names):
         stands = _resting_objects(out, name, manifest.config)
         of_object = [i for i, each in enumerate(names) if each == name]
         for i in sorted(of_object, key=resting.__getitem__):
             yield i, *_under(stands[resting[i]], config, known[i], overridden)
+
+
+def _objects_in_scenes(
+    dataset: SceneRows, rows: npt.NDArray[np.int64], config: Config, overridden: set[str]
+) -> Iterator[tuple[int, PlacedObject, Config]]:
+    """Yield the same for rows of scenes of several objects, where nothing is drawn for a row."""
+    scenes, places, nothing = dataset.scenes[rows], dataset.places[rows], np.full(3, np.nan)
+    for number in np.unique(scenes).tolist():
+        scene = load_scene(dataset.path, number)
+        for place in np.unique(places[scenes == number]).tolist():
+            placed = scene.placed(place)
+            for i in np.flatnonzero((scenes == number) & (places == place)).tolist():
+                yield i, *_under(placed, config, nothing, overridden)
 
 
 def _resting_objects(out: Path, name: str, config: Config) -> list[PlacedObject]:
