@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -17,7 +18,6 @@ from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.frames import transform_points, unpack_pose
 from drakegrasp.grasp import transform_grasp
 from drakegrasp.hand.description import load_hand
-from drakegrasp.reach.arm import load_arm
 from drakegrasp.scoring.references import REFERENCES, ReferenceInput
 from drakegrasp.simulation.attempts import make_attempts
 from drakegrasp.verification.clutter import load_scene
@@ -122,7 +122,7 @@ def test_what_does_not_know_neighbours_is_refused(rows: SceneRows) -> None:
     with pytest.raises(
         ConfigError, match="arm must be None for scenes of several objects, got panda"
     ):
-        score([], rows, references=["own"], arm=load_arm("panda"))
+        score([], rows, references=["own"], arm=SimpleNamespace(name="panda"))  # type: ignore[arg-type]
 
 
 def test_scenes_of_other_trials_are_refused(path: Path, tmp_path: Path) -> None:
