@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from drakegrasp.cluster.connect import connect
     from drakegrasp.config import Config
     from drakegrasp.dataset.check import Violation, check_dataset
+    from drakegrasp.dataset.clutter import Clutter, load_scene
     from drakegrasp.dataset.reader import GraspDataset, Sample
     from drakegrasp.dataset.scenes import SceneDataset, SceneRows
     from drakegrasp.dataset.trials import Trials
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from drakegrasp.simulation.attempts import make_posture
     from drakegrasp.simulation.placement import PlacedObject, place_object, run_trial
     from drakegrasp.simulation.posture import Posture
-    from drakegrasp.verification.clutter import Clutter, load_scene
     from drakegrasp.verification.result import PoseTrial, Verification
     from drakegrasp.vision.depth_image import cloud_from_depth, fit_table
 
@@ -59,7 +59,7 @@ _HOMES = {
     "Arm": "reach.arm",
     "BlankImageError": "errors",
     "BuildReport": "generation.pipeline",
-    "Clutter": "verification.clutter",
+    "Clutter": "dataset.clutter",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",
@@ -93,7 +93,7 @@ _HOMES = {
     "load_arm": "reach.arm",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
-    "load_scene": "verification.clutter",
+    "load_scene": "dataset.clutter",
     "make_benchmark": "api.building",
     "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",

@@ -17,6 +17,7 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.clutter import Clutter
 from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange.columns import HDF5_SUFFIXES
@@ -33,7 +34,6 @@ from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, count_workers, processes, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.placement import PlacedObject, place_object
-from drakegrasp.verification.clutter import Clutter
 from drakegrasp.verification.placing import (
     PlacedGrasp,
     contacts_on_object,

@@ -176,7 +176,8 @@ def replay(
     out: Dataset,
     /,
     *,
-    trial: Annotated[Count, Parameter(metavar="ID")],
+    trial: Annotated[Count | None, Parameter(metavar="ID")] = None,
+    clutter: Annotated[Count | None, Parameter(metavar="ROW")] = None,
     html: NewFile | None = None,
 ) -> None:
     """Run a trial again and compare every value.
@@ -186,11 +187,21 @@ def replay(
     Args:
         out: Directory of the dataset.
         trial: Row of trials.hdf5.
+        clutter: Row of a grasp in clutter.hdf5 that was tried; its labels are compared.
         html: Write a recording of the trial that plays in a browser.
     """
+    from drakegrasp.generation.replay import record_clutter, record_trial, replay_clutter
+
     # All differences are printed: values first, then versions, which may explain them.
-    again = dg.replay_trial(out, trial)
-    say(f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}")
+    if trial is not None and clutter is None:
+        again, record, row = dg.replay_trial(out, trial), record_trial, trial
+    elif clutter is not None and trial is None:
+        again, record, row = replay_clutter(out, clutter), record_clutter, clutter
+    else:
+        raise UsageError("either --trial or --clutter must be given")
+    say(
+        f"trial {again.trial_id} of {again.object_name}: was {again.recorded.label}, is {again.found.label}"
+    )
     for name, difference in again.differences.items():
         how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
         say(f"  {name} differs: {how}")
@@ -198,9 +209,7 @@ def replay(
         say(f"  {package}: {change}")
 
     if html is not None:
-        from drakegrasp.generation.replay import record_trial
-
-        record_trial(out, trial, html)
+        record(out, row, html)
         say(str(html))
     if not again.same:
         sys.exit(1)

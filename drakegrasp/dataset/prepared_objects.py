@@ -23,7 +23,6 @@ from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
-from drakegrasp.objects.surroundings import Surroundings, surroundings_of
 from drakegrasp.runtime.files import atomic_hdf5, validate_seal
 from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.table import Table
@@ -128,17 +127,6 @@ def _save_postures(postures: Table, file: h5py.File) -> None:
         file.create_dataset(name, data=postures[name], dtype=dtype)
     texts = json.dumps(postures.preshape.tolist()).encode()
     file.create_dataset("preshape", data=np.frombuffer(texts, dtype=np.uint8))
-
-
-def surroundings_in(path: Path) -> dict[str, Surroundings]:
-    """Return what is around the objects of a clutter.hdf5, by the names that its scenes have.
-
-    Raises:
-        DataError: If the file has no scenes of several objects, or is damaged.
-    """
-    with opened(path, "scenes of several objects") as file:
-        trees = parse_json(file.attrs["clutter"])["surroundings"].items()
-        return {name: surroundings_of(name, tree, str(path)) for name, tree in trees}
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:

@@ -14,8 +14,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from drakegrasp.arithmetic import Array, multiply
-from drakegrasp.config import Config
+from drakegrasp.arithmetic import Array
+from drakegrasp.dataset.clutter import Clutter
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.paths import clutter_path, object_files
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
@@ -31,7 +31,7 @@ from drakegrasp.dataset.schema import (
 )
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
-from drakegrasp.frames import invert_pose, pack_pose
+from drakegrasp.frames import pack_pose
 from drakegrasp.generation.attempts import disturbance_of, find_attempt, judge_sample
 from drakegrasp.generation.directory import DatasetTask
 from drakegrasp.generation.scenes import (
@@ -51,8 +51,7 @@ from drakegrasp.simulation.attempt import Attempt, usual_materials
 from drakegrasp.simulation.free import first_hit
 from drakegrasp.simulation.pile import PileError, pile_up
 from drakegrasp.simulation.placement import aligned_pose
-from drakegrasp.simulation.scene_cache import cached_scene, run_in
-from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.simulation.scene_cache import cached_scene, run_cached
 from drakegrasp.vision.camera import (
     RING,
     Lens,
@@ -174,8 +173,8 @@ class _Scene:
 
     def __init__(self, task: ClutterTask, journal: Journal) -> None:
         self._task, self._config, self._journal = task, task.config, journal
-        self._objects, self._prepared, self._X_TN = _settled(task)
-        self._models = [each.model for each in self._prepared]
+        self._objects, self._clutter = _settled(task)
+        self._models, self._X_TN = self._clutter.models, self._clutter.X_TO
         self.grasps = self._label_grasps()
 
     def scenes(self) -> Columns:
@@ -185,7 +184,9 @@ class _Scene:
         materials = [vars(usual_materials(model, physics)) for model in self._models]
         values: dict[str, Any] = {
             "object": self._objects,
-            "resting": [_resting(*pair) for pair in zip(self._prepared, self._X_TN, strict=True)],
+            "resting": [
+                _resting(*pair) for pair in zip(self._clutter.prepared, self._X_TN, strict=True)
+            ],
             "probability": np.full(n, np.nan),
             "X_TO": pack_pose(self._X_TN),
             **{name: [each[name] for each in materials] for name in materials[0]},
@@ -200,16 +201,11 @@ class _Scene:
         row["seed"] = np.array([task.stream().key], dtype=np.uint64)
         return row
 
-    def _around(self, i: int, X: Array | None = None) -> Neighbourhood:
-        """Return what is around object i, moved by a pose."""
-        around = Neighbourhood.of(i, self._models, self._X_TN, self._task.surroundings.boxes)
-        return around if X is None else around.moved(X)
-
     # Views
 
     def views(self) -> tuple[Columns, dict[str, list[bytes]], Columns]:
         """Return the rows of /views without images, the packed images, and those of /visible."""
-        task, config, around = self._task, self._config, self._around(0)
+        task, config, around = self._task, self._config, self._clutter.around(0)
         lens = Lens.of(config.scenes)
         renderer = build_renderer(self._models[0], config.camera, around)
         bare = Neighbourhood(models=around.models, X_TN=around.X_TN)
@@ -259,7 +255,7 @@ class _Scene:
     def _label_grasps(self) -> Columns:
         """Return the rows of /grasps, object by object, with both kinds of labels."""
         parts, attempts = list[Columns](), list[Attempt]()
-        for i, prepared in enumerate(self._prepared):
+        for i, prepared in enumerate(self._clutter.prepared):
             trials = self._task.trials[self._objects[i]]
             n = len(trials["resting"])
             X_TO, known = np.tile(self._X_TN[i], (n, 1, 1)), np.ones(n, dtype=bool)
@@ -286,11 +282,12 @@ class _Scene:
 
     def _hits(self, i: int, attempts: Sequence[Attempt], q_closed: AnyArray) -> AnyArray:
         """Return what the hand meets first in each attempt on object i, by codes of the schema."""
-        X_TO, around = self._simulated(i)
+        X_TO, around = self._clutter.simulated(i)
         others = [j for j in range(len(self._models)) if j != i]
-        hits = np.full(len(attempts), HITS_NOTHING, dtype=np.uint8)
+        hits, config = np.full(len(attempts), HITS_NOTHING, dtype=np.uint8), self._config
         for row, attempt in enumerate(attempts):
-            scene = self._scene_of(i, attempt, around)
+            about = config.physics, config.hand_source, attempt.preshape
+            scene = cached_scene(self._models[i], *about, around or None)
             bodies = [each.body.index() for each in scene.neighbours]
             with self._journal.step(f"free {i} {row}", self._limit):
                 met = first_hit(scene, X_TO, attempt, q_closed[row])
@@ -300,34 +297,22 @@ class _Scene:
 
     def _try(self, row: int, i: int, attempt: Attempt) -> dict[str, Any]:
         """Return the labels of a grasp on object i that is tried in the scene."""
-        step, (X_TO, around) = f"{ATTEMPT} {row}", self._simulated(i)
+        step = f"{ATTEMPT} {row}"
         verdict = self._journal.verdict(step)
         if verdict is not None:
             outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
             return {"outcome": outcome}
         with self._journal.step(step, self._limit):
             inject_fault(f"scene {self._task.number}", row)
-            record = run_in(self._scene_of(i, attempt, around), X_TO, attempt, self._config)
-        others = [j for j in range(len(self._models)) if j != i]
-        return labels_of(record, self._models[i], around, others, self._config)
+            return try_grasp(self._clutter, i, attempt)
 
     @property
     def _limit(self) -> float:
         return HANG_FACTOR * self._config.attempt_seconds
 
-    def _simulated(self, i: int) -> tuple[Array, Neighbourhood]:
-        """Return the pose at which object i is simulated, and what is around it there."""
-        X_TO = aligned_pose(self._X_TN[i], self._prepared[i].resting_poses)
-        return X_TO, self._around(i, multiply(X_TO, invert_pose(self._X_TN[i])))
 
-    def _scene_of(self, i: int, attempt: Attempt, around: Neighbourhood) -> Any:
-        config = self._config
-        about = config.physics, config.hand_source, attempt.preshape
-        return cached_scene(self._models[i], *about, around or None)
-
-
-def _settled(task: ClutterTask) -> tuple[tuple[int, ...], list[PreparedObject], Array]:
-    """Return the objects of a scene, by their rows and as they are prepared, and their poses.
+def _settled(task: ClutterTask) -> tuple[tuple[int, ...], Clutter]:
+    """Return the objects of a scene, by their rows and at rest together.
 
     Raises:
         DataError: If no set of objects comes to rest.
@@ -348,7 +333,13 @@ def _settled(task: ClutterTask) -> tuple[tuple[int, ...], list[PreparedObject], 
             except PileError as error:
                 reason = str(error)
                 continue
-            return objects, prepared, X_TN
+            return objects, Clutter(
+                names=tuple(task.names[row] for row in objects),
+                X_TO=X_TN,
+                surroundings=task.surroundings,
+                config=task.config,
+                prepared=tuple(prepared),
+            )
     raise DataError(
         f"scene {task.number}: its objects must come to rest in the {task.surroundings.name}, in "
         f"one of {len(task.sets) * PILES} draws, got: {reason}"
@@ -377,18 +368,10 @@ def _untried(count: int) -> Columns:
 _FLAGS = ("tested", "lifted", "kept", "clean", "precision", "stable")
 
 
-def labels_of(
-    record: TrialRecord, model: Any, around: Neighbourhood, others: Sequence[int], config: Config
-) -> dict[str, Any]:
-    """Return the labels of a grasp that was tried among others, by their names in the schema.
-
-    Args:
-        record: Record of its trial.
-        model: The object.
-        around: What was around it at the start.
-        others: Indices of the neighbours in the scene.
-        config: The rules.
-    """
+def try_grasp(clutter: Clutter, i: int, attempt: Attempt) -> dict[str, Any]:
+    """Return the labels of a grasp on object i among the others, by their names in the schema."""
+    config, model, (X_TO, around) = clutter.config, clutter.models[i], clutter.simulated(i)
+    record = run_cached(model, X_TO, attempt, config, around or None)
     outcome, moved = record.outcome, disturbance_of(record, around)
     labels = {
         "outcome": outcome,
@@ -402,7 +385,7 @@ def labels_of(
         return labels | {"clean": labels["kept"]}
     return labels | {
         "clean": labels["kept"] and moved.is_small,
-        "neighbour": others[moved.neighbour],
+        "neighbour": moved.neighbour + (moved.neighbour >= i),
         "neighbour_shift": moved.shift,
         "neighbour_turn": moved.turn,
     }

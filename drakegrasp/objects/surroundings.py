@@ -32,6 +32,8 @@ from drakegrasp.yaml_text import parse_yaml
 
 #: Thickness of the walls of bin and shelf [m]; a thin compliant wall would let objects through.
 WALL = 0.02
+#: Decimals of the yaw of a box [degree].
+DECIMALS = 9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +75,10 @@ class Surroundings:
                 {
                     "size": box.size.tolist(),
                     "position": box.X_TB[:3, 3].tolist(),
-                    "yaw_deg": float(np.degrees(np.arctan2(box.X_TB[1, 0], box.X_TB[0, 0]))),
+                    # Rounded, so that what is read back has the same bits.
+                    "yaw_deg": round(
+                        float(np.degrees(np.arctan2(box.X_TB[1, 0], box.X_TB[0, 0]))), DECIMALS
+                    ),
                 }
                 for box in self.boxes
             ],
@@ -211,7 +216,7 @@ def surroundings_of(name: str, tree: Any, where: str) -> Surroundings:
         raise ConfigError(f"{where}: {mistake}") from None
     boxes = []
     for box in read.boxes:
-        turn = rotation_about([0.0, 0.0, 1.0], np.radians(box.yaw_deg))
+        turn = rotation_about([0.0, 0.0, 1.0], np.radians(round(box.yaw_deg, DECIMALS)))
         boxes.append(Box(size=np.array(box.size), X_TB=make_pose(turn, box.position)))
     extent = np.array(read.extent)
     return Surroundings(name=name, extent=extent, drops=read.drops, boxes=tuple(boxes))

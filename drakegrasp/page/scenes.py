@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.clutter import surroundings_in
 from drakegrasp.dataset.hdf5 import validate_codes
 from drakegrasp.dataset.paths import CLUTTER_FILE, SCENES_FILE
-from drakegrasp.dataset.prepared_objects import surroundings_in
 from drakegrasp.dataset.scenes import SceneDataset, validate_state
 from drakegrasp.dataset.schema import (
     HITS_NOTHING,

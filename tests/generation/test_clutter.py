@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.commands import error_line, run
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.paths import CLUTTER_FOLDER, clutter_path
@@ -15,7 +16,8 @@ from drakegrasp.dataset.schema import HITS_NOTHING, NOT_TRIED
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
-from drakegrasp.objects.surroundings import load_surroundings
+from drakegrasp.generation.replay import replay_clutter
+from drakegrasp.objects.surroundings import load_surroundings, surroundings_of
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import processes
 
@@ -119,3 +121,49 @@ def test_objects_without_room_and_sets_without_samples_are_refused(
     assemble(out, rejected=Trials(out).where(kept=True).trial_ids.tolist())
     with pytest.raises(DataError, match="must have samples to be grasped among others, got none"):
         make_clutter(out, asked())
+
+
+def test_every_try_is_replayed_to_the_bit(small_clutter: Path) -> None:
+    """From the stored poses alone."""
+    with h5py.File(small_clutter / "clutter.hdf5") as file:
+        outcomes, alone = file["grasps/outcome"][:], file["scenes/object"][:, 1] < 0
+        among = ~alone[file["grasps/scene"][:]]
+    tried = np.flatnonzero(outcomes != NOT_TRIED)
+    assert among[tried].any() and len(set(outcomes[tried].tolist())) > 1
+    for row in tried.tolist():
+        again = replay_clutter(small_clutter, row)
+        assert again.same, again.differences
+        assert again.found == outcomes[row]
+
+
+def test_replay_says_what_differs_and_which_rows_there_are(
+    small_clutter: Path, tmp_path: Path
+) -> None:
+    """A neighbour that stood elsewhere, an outcome of another row, and rows that were not tried."""
+    out = Path(shutil.copytree(small_clutter, tmp_path / "out"))
+    with h5py.File(out / "clutter.hdf5", "r+") as file:
+        tried = np.flatnonzero(file["grasps/outcome"][:] != NOT_TRIED)
+        several = file["scenes/object"][:, 1] >= 0
+        row = tried[several[file["grasps/scene"][:][tried]]][0]
+        file["grasps/outcome"][row] = Outcome.DROPPED
+        file["grasps/neighbour_shift"][row] += 1e-15
+        untried = int(np.argmax(file["grasps/outcome"][:] == NOT_TRIED))
+    result = run("replay", out, "--clutter", row, "--html", tmp_path / "page.html")
+    assert result.exit_code == 1 and "was dropped, is " in result.stdout
+    assert "outcome differs" in result.stdout and "neighbour_shift differs" in result.stdout
+    assert (tmp_path / "page.html").stat().st_size > 100_000
+    known = f"row must be of a grasp that was tried, {tried[0]} to {tried[-1]}, got"
+    for wrong in (untried, 10**6):
+        assert f"{known} {wrong}" in error_line(run("replay", out, "--clutter", wrong))
+    for options in ((), ("--clutter", row, "--trial", 0)):
+        assert "either --trial or --clutter must be given" in run("replay", out, *options).stderr
+
+
+def test_own_boxes_are_read_back_with_the_same_bits(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    for yaw in (30.0, 0.1, -17.3, 123.4567890123):
+        box = f"{{size: [0.1, 0.2, 0.3], position: [0, 0.1, 0], yaw_deg: {yaw}}}"
+        path.write_text(f"extent: [0.1, 0.1]\nboxes: [{box}]\n")
+        first = load_surroundings(path)
+        again = surroundings_of("own", first.tree(), "own")
+        np.testing.assert_array_equal(again.boxes[0].X_TB, first.boxes[0].X_TB)

@@ -12,6 +12,7 @@ import pytest
 
 from drakegrasp.api.verifying import verify_grasp, verify_grasps
 from drakegrasp.config import Config
+from drakegrasp.dataset.clutter import Clutter, load_scene
 from drakegrasp.dataset.scenes import SceneDataset
 from drakegrasp.errors import DataError, DrakegraspError, GraspError
 from drakegrasp.frames import invert_pose, make_pose, rotation_about
@@ -20,7 +21,6 @@ from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.placement import place_object
-from drakegrasp.verification.clutter import Clutter, load_scene
 
 pytestmark = pytest.mark.sim
 

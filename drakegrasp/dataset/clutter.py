@@ -9,14 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
-from drakegrasp.dataset.hdf5 import open_scenes, read_columns, read_texts
+from drakegrasp.dataset.hdf5 import open_scenes, opened, read_columns, read_texts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.schema import NO_OBJECT, SCENE_FIELDS
 from drakegrasp.errors import GraspError
 from drakegrasp.foreign_files import parse_json
-from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.frames import Array, invert_pose, unpack_pose
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.surroundings import (
     Neighbourhood,
     Surroundings,
@@ -44,6 +46,11 @@ class Clutter:
     config: Config
     prepared: tuple[PreparedObject, ...]
 
+    @property
+    def models(self) -> tuple[ObjectModel, ...]:
+        """The objects."""
+        return tuple(each.model for each in self.prepared)
+
     def placed(self, object: int | str) -> PlacedObject:
         """Return an object with the others around it.
 
@@ -57,14 +64,23 @@ class Clutter:
             GraspError: If there is no such object, or several have the name.
         """
         i = self._index(object)
-        models, own = [each.model for each in self.prepared], self.prepared[i]
+        own = self.prepared[i]
         return PlacedObject(
             model=own.model,
             X_TO=self.X_TO[i],
             config=self.config,
-            around=Neighbourhood.of(i, models, self.X_TO, self.surroundings.boxes) or None,
+            around=self.around(i) or None,
             X_TO_rest=aligned_pose(self.X_TO[i], own.resting_poses),
         )
+
+    def around(self, i: int) -> Neighbourhood:
+        """Return what is around object i."""
+        return Neighbourhood.of(i, self.models, self.X_TO, self.surroundings.boxes)
+
+    def simulated(self, i: int) -> tuple[Array, Neighbourhood]:
+        """Return the pose (4, 4) at which object i is simulated, and what is around it there."""
+        X_TO = aligned_pose(self.X_TO[i], self.prepared[i].resting_poses)
+        return X_TO, self.around(i).moved(multiply(X_TO, invert_pose(self.X_TO[i])))
 
     def __repr__(self) -> str:
         return f"Clutter({', '.join(self.names)}; {self.surroundings.name})"
@@ -95,12 +111,11 @@ def load_scene(path: str | Path, number: int) -> Clutter:
         GraspError: If there is no such scene.
         DataError: If the file or the dataset is missing or damaged.
     """
-    path, trees = Path(path), {}
+    path = Path(path)
     with open_scenes(path) as file:
         scenes = read_columns(file["scenes"], SCENE_FIELDS, ["object", "X_TO", "surroundings"])
         known = read_texts(file["objects"]["name"])
-        if "clutter" in file.attrs:
-            trees = parse_json(file.attrs["clutter"])["surroundings"]
+        several = "clutter" in file.attrs
     whole = isinstance(number, int) and not isinstance(number, bool)
     if not whole or not 0 <= number < scenes.count:
         raise GraspError(f"number must be that of a scene, 0 to {scenes.count - 1}, got {number!r}")
@@ -113,9 +128,18 @@ def load_scene(path: str | Path, number: int) -> Clutter:
     return Clutter(
         names=names,
         X_TO=unpack_pose(scenes["X_TO"][number, : len(names)]),
-        surroundings=surroundings_of(around, trees[around], str(path))
-        if around in trees
-        else load_surroundings("table"),
+        surroundings=surroundings_in(path)[around] if several else load_surroundings("table"),
         config=config,
         prepared=tuple(prepared[name] for name in names),
     )
+
+
+def surroundings_in(path: Path) -> dict[str, Surroundings]:
+    """Return what is around the objects of a clutter.hdf5, by the names that its scenes have.
+
+    Raises:
+        DataError: If the file has no scenes of several objects, or is damaged.
+    """
+    with opened(path, "scenes of several objects") as file:
+        trees = parse_json(file.attrs["clutter"])["surroundings"].items()
+        return {name: surroundings_of(name, tree, str(path)) for name, tree in trees}
