@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import asdict
+from functools import partial
 from textwrap import fill
 from typing import Annotated
 
@@ -194,14 +195,13 @@ def replay(
 
     # All differences are printed: values first, then versions, which may explain them.
     if trial is not None and clutter is None:
-        again, record, row = dg.replay_trial(out, trial), record_trial, trial
+        again, record = dg.replay_trial(out, trial), partial(record_trial, out, trial)
     elif clutter is not None and trial is None:
-        again, record, row = replay_clutter(out, clutter), record_clutter, clutter
+        again, record = replay_clutter(out, clutter), partial(record_clutter, out, clutter)
     else:
         raise UsageError("either --trial or --clutter must be given")
-    say(
-        f"trial {again.trial_id} of {again.object_name}: was {again.recorded.label}, is {again.found.label}"
-    )
+    was, now = again.recorded.label, again.found.label
+    say(f"trial {again.trial_id} of {again.object_name}: was {was}, is {now}")
     for name, difference in again.differences.items():
         how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
         say(f"  {name} differs: {how}")
@@ -209,7 +209,7 @@ def replay(
         say(f"  {package}: {change}")
 
     if html is not None:
-        record(out, row, html)
+        record(html)
         say(str(html))
     if not again.same:
         sys.exit(1)

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, with_whole_lifts
+from drakegrasp.dataset.clutter import load_scene
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
@@ -52,7 +53,6 @@ from drakegrasp.simulation.placement import (
 )
 from drakegrasp.simulation.posture import Posture
 from drakegrasp.simulation.settle import find_resting_poses
-from drakegrasp.verification.clutter import load_scene
 from drakegrasp.verification.prediction import ContactRows, RowChoice, choose_rows, read_grasps
 
 #: Names of the frames of a dataset's cameras: the data file's own camera, and the other camera.

@@ -161,7 +161,7 @@ def test_replay_says_what_differs_and_which_rows_there_are(
 
 def test_own_boxes_are_read_back_with_the_same_bits(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
-    for yaw in (30.0, 0.1, -17.3, 123.4567890123):
+    for yaw in (*np.linspace(-180.0, 180.0, 181).tolist(), 123.4567890123):
         box = f"{{size: [0.1, 0.2, 0.3], position: [0, 0.1, 0], yaw_deg: {yaw}}}"
         path.write_text(f"extent: [0.1, 0.1]\nboxes: [{box}]\n")
         first = load_surroundings(path)

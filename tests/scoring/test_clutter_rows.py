@@ -12,6 +12,7 @@ import pytest
 
 from drakegrasp.api.scoring import score
 from drakegrasp.api.verifying import verify_grasp, verify_grasps
+from drakegrasp.dataset.clutter import load_scene
 from drakegrasp.dataset.scenes import SceneRows, open_rows
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
@@ -20,7 +21,6 @@ from drakegrasp.grasp import transform_grasp
 from drakegrasp.hand.description import load_hand
 from drakegrasp.scoring.references import REFERENCES, ReferenceInput
 from drakegrasp.simulation.attempts import make_attempts
-from drakegrasp.verification.clutter import load_scene
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 pytestmark = pytest.mark.sim
