@@ -343,6 +343,7 @@ class Clutter(Scenes):
             name, shift = self._named(i, grasp["neighbour"]), 1e3 * grasp["neighbour_shift"]
             moved = f"{name} by {shift:.1f} mm, {np.degrees(grasp['neighbour_turn']):.1f}°"
         return {
+            "row": row,
             "trial": int(grasp["trial_id"]),
             "object": self._named(i, grasp["object"]),
             "colour": INSTANCE_COLOURS[grasp["object"]],
