@@ -39,7 +39,8 @@ def predict_scenes(
     The result does not depend on the workers.
 
     Args:
-        scenes: The file scenes.hdf5 of a dataset.
+        scenes: The file scenes.hdf5 or clutter.hdf5 of a dataset. In the latter, lifts are tried
+            among the other objects, as completed from the view, and among the surroundings.
         split: `train`, `valid` or `test`.
         simulate: Largest number of grasps of a view that are lifted on the object as completed from
             this view, see `rank`; the lifts have the rules of the dataset.
@@ -52,12 +53,13 @@ def predict_scenes(
         show: Whether to show progress on standard error.
 
     Returns:
-        Postures in {O} with the row that each is for (`of_row`, in the order of `SceneDataset`),
-        its resting pose and its chance of being a sample (`confidence`); and the number of views
+        Postures in {O} with the row that each is for (`of_row`, in the order of `SceneDataset`,
+        for clutter.hdf5 of `SceneRows`), its resting pose and its chance of being a sample (`confidence`); and the number of views
         that show too little of their object for any.
 
     Raises:
-        ConfigError: If client and workers are both given, or an override is invalid.
+        ConfigError: If client and workers are both given, an override is invalid, or an arm is
+            given with clutter.hdf5.
         DataError: If the file cannot be used.
         GraspError: If no view yields a posture, or a view is invalid.
         MachineError: If a worker would give other results than this machine.

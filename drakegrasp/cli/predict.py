@@ -73,10 +73,10 @@ def predict(
 ) -> None:
     """Write grasps for what a camera saw, best first.
 
-    INPUT is the file scenes.hdf5 of a dataset, for all views of a split, in the rows of
-    `drakegrasp score`; or a cloud of one object (.npy of shape (n, 3), or .ply), over a table that
-    is z = 0, with +z up; or a depth image (.png of 16 bits, or .npy in metres) with a camera matrix
-    and a mask of one object.
+    INPUT is the file scenes.hdf5 or clutter.hdf5 of a dataset, for all views of a split, in the
+    rows of `drakegrasp score`; or a cloud of one object (.npy of shape (n, 3), or .ply), over a
+    table that is z = 0, with +z up; or a depth image (.png of 16 bits, or .npy in metres) with a
+    camera matrix and a mask of one object.
 
     Grasps are proposed and ordered by closing the hand on the points. Then the first ones are
     tried by lifts in simulation, on the object completed from what was seen, until one holds in all

@@ -20,19 +20,22 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.scenes import SceneDataset
-from drakegrasp.errors import GraspError, TooLittleSeenError
+from drakegrasp.dataset.scenes import SceneDataset, SceneRows
+from drakegrasp.errors import ConfigError, GraspError, TooLittleSeenError
+from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import override_config
 from drakegrasp.mesh.cloud import hull_solid, read_cloud
+from drakegrasp.objects.surroundings import Box, Neighbourhood, surroundings_of
 from drakegrasp.reach.arm import Arm
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.scoring.ranking import Ranking, chosen_hand, rank
-from drakegrasp.simulation.attempts import GraspTable, join_attempts, make_attempts
+from drakegrasp.scoring.ranking import Ranking, chosen_hand, rank, seen_neighbours
+from drakegrasp.simulation.attempts import UNTOLD, GraspTable, join_attempts, make_attempts
 from drakegrasp.simulation.closing import closing_positions
 from drakegrasp.simulation.palms import Palms
 from drakegrasp.vision.depth_image import View, cloud_from_depth
@@ -103,6 +106,7 @@ def predict(
     count: int | None = None,
     name: str = "seen",
     arm: Arm | None = None,
+    around: Neighbourhood | None = None,
 ) -> tuple[GraspTable, Ranking]:
     """Return grasps for what a camera saw of an object, the best first, and their ranking.
 
@@ -114,6 +118,7 @@ def predict(
         count: Maximum number of grasps; None for all that were proposed.
         name: Name of the object in the table.
         arm: See `rank`.
+        around: See `rank`.
 
     Returns:
         Postures in the frame "table", whose `confidence` is the chance of a sample, or 0 for what
@@ -124,7 +129,8 @@ def predict(
     """
     hand = load_hand(config.hand_source)
     proposals = propose(cloud, hand, name=name)
-    ranking = rank(proposals, cloud, hand, simulate=simulate, view=view, config=config, arm=arm)
+    how = {"simulate": simulate, "view": view, "config": config, "arm": arm, "around": around}
+    ranking = rank(proposals, cloud, hand, **how)
     order = ranking.order[:count]
     chosen = replace(proposals.at(order.tolist()), row=np.arange(len(order)))
     if arm is None:
@@ -150,10 +156,11 @@ def predict_scenes(
 ) -> tuple[GraspTable, int]:
     """Return grasps for all views of a split, in the frames of their objects.
 
-    The rows of the views are those of `drakegrasp score`, see `dataset.scenes.SceneRows`.
+    The rows of the views are those of `drakegrasp score`, see `dataset.scenes.SceneRows`. Among
+    other objects, lifts are tried among those that the view shows, completed from it.
 
     Args:
-        path: OUT/scenes.hdf5.
+        path: OUT/scenes.hdf5 or OUT/clutter.hdf5.
         split: `train`, `valid` or `test`.
         simulate: See `rank`; the lifts have the rules of the dataset.
         count: Maximum number of grasps of a view; None for all.
@@ -169,47 +176,66 @@ def predict_scenes(
     Raises:
         DataError: If the file cannot be used.
         GraspError: If no view yields a posture, or a view is invalid.
-        ConfigError: If an override is invalid.
+        ConfigError: If an override is invalid, or an arm is given with several objects.
     """
     data = SceneDataset(path, points=None, split=split, negatives="none", balance="view", grasps=1)
     if not len(data):
         raise GraspError(f"{path}: {data.emptiness}")
+    if data.several and arm is not None:
+        raise ConfigError(f"arm must be None for scenes of several objects, got {arm.name}")
+    rows = SceneRows(path, split=split) if data.several else None
+    views = list(data.views.tolist() if rows is None else rows.views.tolist())
+    places = [0] * len(views) if rows is None else rows.places.tolist()
     config = override_config(read_manifest(data.path.parent).config, overrides)
     work = partial(_predict_view, config, simulate, count, arm)
     tables = list[GraspTable]()
-    for row, table in enumerate(in_order(execute)(work, _views(data))):
+    for row, table in enumerate(in_order(execute)(work, _views(data, views, places))):
         if table is not None:
             tables.append(replace(table, of_row=np.full(len(table), row)))
-        report(row + 1, len(data))
+        report(row + 1, len(views))
     if not tables:
         raise GraspError(
             f"{path}: must have views with a sample in {split} that show their object, got "
-            f"{len(data)} views"
+            f"{len(views)} views"
         )
-    return join_attempts(tables), len(data) - len(tables)
+    return join_attempts(tables), len(views) - len(tables)
 
 
 class _SceneView(NamedTuple):
-    """A view of a scene: its object with resting pose and pose X_TO (4, 4), and the image."""
+    """A view of a scene: its object with resting pose and pose X_TO (4, 4), and the image.
+
+    In scenes of several objects, `instances` (h, w) is the mask of all of them, and there are the
+    boxes of the surroundings.
+    """
 
     name: str
     resting: int
     X_TO: Array
     view: View
+    instances: AnyArray | None = None
+    boxes: tuple[Box, ...] = ()
 
 
-def _views(data: SceneDataset) -> Iterator[_SceneView]:
-    """Yield the views of a dataset in the order of its rows."""
+def _views(
+    data: SceneDataset, chosen: Sequence[int], places: Sequence[int]
+) -> Iterator[_SceneView]:
+    """Yield views of a dataset, each with the object at its place in the scene."""
     views, scenes = data.tables["views"], data.tables["scenes"]
-    for i in data.views.tolist():
+    trees = parse_json(data.around)["surroundings"] if data.several else {}
+    for i, place in zip(chosen, places, strict=True):
         scene, seen = views["scene"][i], data.images(i)
-        X_TC = unpack_pose(views["X_TC"][i])
-        yield _SceneView(
-            name=data.names[scenes["object"][scene, 0]],
-            resting=int(scenes["resting"][scene, 0]),
-            X_TO=unpack_pose(scenes["X_TO"][scene, 0]),
-            view=View(depth=seen["depth"], mask=seen["mask"], K=seen["K"], X_TC=X_TC),
+        X_TC, mask = unpack_pose(views["X_TC"][i]), (seen["mask"] == place + 1).astype(np.uint8)
+        found = _SceneView(
+            name=data.names[scenes["object"][scene, place]],
+            resting=int(scenes["resting"][scene, place]),
+            X_TO=unpack_pose(scenes["X_TO"][scene, place]),
+            view=View(depth=seen["depth"], mask=mask, K=seen["K"], X_TC=X_TC),
         )
+        if data.several:
+            name = str(scenes["surroundings"][scene])
+            boxes = surroundings_of(name, trees[name], str(data.path)).boxes
+            found = found._replace(resting=UNTOLD, instances=seen["mask"], boxes=boxes)
+        yield found
 
 
 def _predict_view(
@@ -222,10 +248,11 @@ def _predict_view(
     """
     view = seen.view
     try:
-        cloud = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
-        found, _ = predict(
-            cloud, view, config, simulate=simulate, count=count, name=seen.name, arm=arm
-        )
+        cloud, around = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC), None
+        if seen.instances is not None and simulate:
+            around = seen_neighbours(view, seen.instances, seen.boxes, config)
+        how = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
+        found, _ = predict(cloud, view, config, **how, around=around)
     except TooLittleSeenError:
         return None
     except GraspError as error:

@@ -14,6 +14,7 @@ aside and with less friction. Mass, friction and filters are those of the config
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import Config
-from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.errors import ConfigError, GraspError, TooLittleSeenError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose, make_pose, read_pose
 from drakegrasp.generation.attempts import judge_sample
@@ -32,6 +33,7 @@ from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
 from drakegrasp.objects.model import object_of
+from drakegrasp.objects.surroundings import Box, Neighbourhood
 from drakegrasp.reach.arm import Arm
 from drakegrasp.reach.reaching import Reach, reach_attempt
 from drakegrasp.runtime.environment import one_thread
@@ -41,7 +43,7 @@ from drakegrasp.simulation.closing import closing_features
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import start_of
 from drakegrasp.simulation.scene_cache import run_cached
-from drakegrasp.table import Table
+from drakegrasp.table import AnyArray, Table
 from drakegrasp.vision.depth_image import View, cloud_from_depth, complete
 
 #: Moves of the palm along its axes [m] over which a score is averaged; the first is no move.
@@ -141,6 +143,7 @@ def rank(
     view: View | Sequence[npt.ArrayLike] | None = None,
     config: Config | None = None,
     arm: Arm | None = None,
+    around: Neighbourhood | None = None,
 ) -> Ranking:
     """Return the order in which to try proposals, by closing the hand on what a camera saw.
 
@@ -162,6 +165,8 @@ def rank(
         config: Mass of the object, friction and all rules of the lifts; None for the preset `fast`.
         arm: An arm, see `load_arm`. It is asked for all proposals, with the convex hull of the
             points as the object, which takes about 0.1 s each.
+        around: Neighbours and walls in {T}, see `seen_neighbours`, among which lifts are tried;
+            closing on points does not know them.
 
     Raises:
         GraspError: If the cloud, the poses, the spread or the view are invalid, postures are in {O}
@@ -192,7 +197,7 @@ def rank(
     # Lift the first ones.
     share, completion = np.full(len(score), np.nan), ""
     if tried := [i for i in order[:simulate].tolist() if known[i]]:
-        completed = place_completed(solids, view, lifting_config(hand, config))
+        completed = place_completed(solids, view, lifting_config(hand, config), around)
         share[tried] = lift_shares(completed, [starts[i] for i in tried])
         completion = "cloud" if view is None else "view"
     chance = np.where(known, chances(score, share), 0.0)
@@ -351,7 +356,10 @@ def lifting_config(hand: Hand, config: Config | None) -> Config:
 
 
 def place_completed(
-    solids: Sequence[Solid], view: View | None, config: Config
+    solids: Sequence[Solid],
+    view: View | None,
+    config: Config,
+    around: Neighbourhood | None = None,
 ) -> list[PlacedObject]:
     """Return the object on the table, completed from each of the guessed solids in {T}.
 
@@ -359,6 +367,7 @@ def place_completed(
         solids: Solids, see `mesh.cloud`.
         view: The image that shows the object; None if it is not known.
         config: The configuration of the lifts, with the mass of the object.
+        around: What is around it, in {T}.
 
     Raises:
         TooLittleSeenError: If no solid is left.
@@ -369,8 +378,35 @@ def place_completed(
         surface = complete(solid.field, view)
         model = object_of(surface, config.objects, name="seen", class_name="seen", mesh_sha256="")
         X_TO = make_pose(np.eye(3), -model.p_OM)
-        placed.append(PlacedObject(model=model, X_TO=X_TO, config=config))
+        placed.append(PlacedObject(model=model, X_TO=X_TO, config=config, around=around))
     return placed
+
+
+def seen_neighbours(
+    view: View, instances: AnyArray, boxes: Sequence[Box], config: Config
+) -> Neighbourhood:
+    """Return what is around an object, as far as an image shows it, in {T}.
+
+    Args:
+        view: The image, whose mask shows the object.
+        instances: (h, w), another value on each object, 0 beside all.
+        boxes: Walls that are known.
+        config: The configuration of the lifts, with the mass of a neighbour.
+
+    Raises:
+        MeshError: If a neighbour cannot be simulated.
+    """
+    found = list[PlacedObject]()
+    for value in np.unique(instances[(instances != 0) & (view.mask == 0)]).tolist():
+        own = view._replace(mask=(instances == value).astype(np.uint8))
+        with suppress(TooLittleSeenError):  # then it is not known
+            solid = hull_solid(read_cloud(cloud_from_depth(own.depth, own.K, own.mask, own.X_TC)))
+            found += place_completed([solid], own, config)
+    return Neighbourhood(
+        models=tuple(each.model for each in found),
+        X_TN=np.array([each.X_TO for each in found]).reshape(-1, 4, 4),
+        boxes=tuple(boxes),
+    )
 
 
 @one_thread
@@ -413,8 +449,10 @@ def _lifts_to_sample(placed: PlacedObject, start: Attempt) -> bool:
     """Return whether a lift of the object from a start in {T} ends as a sample."""
     config = placed.config
     attempt = replace(start, X_OG=multiply(invert_pose(placed.X_TO), start.X_OG))
-    trial = run_cached(placed.model, placed.X_TO_simulated, attempt, config)
-    return judge_sample(placed.model, trial, config) is Removal.KEPT
+    around = placed.around_simulated
+    trial = run_cached(placed.model, placed.X_TO_simulated, attempt, config, around)
+    views = around is None  # the cameras of a build see one object
+    return judge_sample(placed.model, trial, config, views=views) is Removal.KEPT
 
 
 def chances(score: Array, share: Array) -> Array:
