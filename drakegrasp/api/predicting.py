@@ -53,9 +53,9 @@ def predict_scenes(
         show: Whether to show progress on standard error.
 
     Returns:
-        Postures in {O} with the row that each is for (`of_row`, in the order of `SceneDataset`,
-        for clutter.hdf5 of `SceneRows`), its resting pose and its chance of being a sample (`confidence`); and the number of views
-        that show too little of their object for any.
+        Postures in {O} with the row that each is for (`of_row`, in the order of `SceneDataset`, for
+        clutter.hdf5 of `SceneRows`), its resting pose and its chance of being a sample
+        (`confidence`); and the number of views that show too little of their object for any.
 
     Raises:
         ConfigError: If client and workers are both given, an override is invalid, or an arm is
