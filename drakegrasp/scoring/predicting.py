@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -129,8 +129,8 @@ def predict(
     """
     hand = load_hand(config.hand_source)
     proposals = propose(cloud, hand, name=name)
-    how = {"simulate": simulate, "view": view, "config": config, "arm": arm, "around": around}
-    ranking = rank(proposals, cloud, hand, **how)
+    how: dict[str, Any] = {"simulate": simulate, "view": view, "config": config, "arm": arm}
+    ranking = rank(proposals, cloud, hand, **how, around=around)
     order = ranking.order[:count]
     chosen = replace(proposals.at(order.tolist()), row=np.arange(len(order)))
     if arm is None:
@@ -251,7 +251,7 @@ def _predict_view(
         cloud, around = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC), None
         if seen.instances is not None and simulate:
             around = seen_neighbours(view, seen.instances, seen.boxes, config)
-        how = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
+        how: dict[str, Any] = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
         found, _ = predict(cloud, view, config, **how, around=around)
     except TooLittleSeenError:
         return None

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from pydrake.geometry import (
     GeometrySet,
     InMemoryMesh,
     Mesh,
+    GeometryInstance,
     Meshcat,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
@@ -72,7 +74,7 @@ from drakegrasp.hand.file_format import MODELS, Finger, with_efforts
 from drakegrasp.hand.kinematics import within_load
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
-from drakegrasp.mesh.surfaces import Solid, obj_text
+from drakegrasp.mesh.surfaces import Solid, hull_text, obj_text
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.simulation.attempt import Materials
@@ -94,6 +96,8 @@ SOFT, LAG = 0.1, 0.1
 TABLE_MARGIN = 5e-5
 #: Resolution hint for the few hand parts that are cylinders [m]; boxes and meshes ignore it.
 RESOLUTION_HINT = 0.005
+#: Directions (n, 3) of the simpler hulls.
+HULL_DIRECTIONS = np.array([d for d in product(range(-2, 3), repeat=3) if any(d)], dtype=float)
 #: Frames per simulated second in Meshcat [Hz]. A power of two makes their times exact, so that
 #: rounding errors do not merge any two of them.
 MESHCAT_RATE = 32.0
@@ -340,13 +344,32 @@ def _add_around(
 def _add_hull(
     plant: MultibodyPlant, body: RigidBody, model: ObjectModel, physics: PhysicsConfig
 ) -> None:
-    """Add the compliant convex hull by which an object meets its neighbours."""
+    """Add the compliant convex hull by which an object meets its neighbours.
+
+    Drake refuses a hull with a face without an area, as those of dense points may have; then the
+    hull is that of the points which are farthest in some directions.
+    """
     properties = ProximityProperties()
     AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
     _add_material(properties, object_friction(physics), physics)
-    text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
+    points = model.collision_vertices
+    text = obj_text(points, model.collision_faces, normals=False)
     hull = Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "hull")), 1.0)
+    if not _is_accepted(hull, properties):
+        text = hull_text(points[np.unique((points @ HULL_DIRECTIONS.T).argmax(axis=0))])
+        hull = Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "hull")), 1.0)
     plant.RegisterCollisionGeometry(body, RigidTransform(), hull, "hull", properties)
+
+
+def _is_accepted(shape: Convex, properties: ProximityProperties) -> bool:
+    """Return whether Drake accepts a shape; a plant that refused one cannot be used any more."""
+    graph, instance = SceneGraph(), GeometryInstance(RigidTransform(), shape, "hull")
+    instance.set_proximity_properties(properties)
+    try:
+        graph.RegisterAnchoredGeometry(graph.RegisterSource("trial"), instance)
+    except RuntimeError:
+        return False
+    return True
 
 
 def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:

@@ -111,7 +111,7 @@ def test_a_view_without_its_object_is_told_from_a_bad_one(view):
     beside[-20:-10, 60:90] = True
 
     def predicted(**changes):
-        return _predict_view(CONFIG, 0, 1, scene._replace(view=view._replace(**changes)))
+        return _predict_view(CONFIG, 0, 1, None, scene._replace(view=view._replace(**changes)))
 
     for changes in ({"mask": 0 * view.mask}, {"mask": beside}):
         assert predicted(**changes) is None

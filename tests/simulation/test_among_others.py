@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.objects import STANDOFF, box_model, from_above, standing
@@ -166,3 +168,17 @@ def test_what_the_hand_meets_first_is_told(
     assert met(beside(brick, 0.0, 0.0, below=palm + 0.12)) == "neighbour_0"
     wall = Box(size=np.array([0.5, 0.02, 0.3]), X_TB=make_pose(UP, [0.0, 0.05, 0.15]))
     assert met(Neighbourhood(X_TN=np.zeros((0, 4, 4)), boxes=(wall,))) == "table"
+
+
+def test_a_neighbour_with_points_that_are_almost_equal_can_be_there(
+    cube: ObjectModel, brick: ObjectModel, config: Config, hand: Hand
+) -> None:
+    """Drake refuses the hull of such points; surfaces of images have them."""
+    points, faces = brick.collision_vertices, brick.collision_faces
+    doubled = replace(
+        brick,
+        collision_vertices=np.concatenate([points, points + 1e-14 * np.array([1, -1, 1])]),
+        collision_faces=np.concatenate([faces, faces + len(points)]).astype(faces.dtype),
+    )
+    around = Neighbourhood(models=(doubled,), X_TN=make_pose(UP, [0.5, 0.0, 0.02])[None])
+    assert scene_of(cube, config, hand, around).neighbours
