@@ -10,13 +10,13 @@ import pytest
 
 import drakegrasp as dg
 from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.clutter import load_scene
 from drakegrasp.dataset.scenes import SceneDataset, SceneRows
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.scoring.predicting import predict_scenes
 from drakegrasp.scoring.ranking import seen_neighbours
-from drakegrasp.verification.clutter import load_scene
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 from drakegrasp.vision.depth_image import View
 
