@@ -292,12 +292,13 @@ class Clutter(Scenes):
             own = known[grasps["object"][known] == k]
             hits = [self._named(i, hit) for hit in grasps["hit"][own] if hit != HITS_NOTHING]
             shares = self.data.tables["views"]["visible_share"][self.views(i), k]
-            shares = shares[np.isfinite(shares)]
+            shares = np.sort(shares[np.isfinite(shares)])
+            seen = dict.fromkeys(f"{share:.0%}" for share in shares)
             objects.append(
                 {
                     "name": self._named(i, k),
                     "colour": INSTANCE_COLOURS[k],
-                    "visible": f"{shares.min():.0%} to {shares.max():.0%}" if len(shares) else "",
+                    "visible": " to ".join([*seen][:: max(len(seen) - 1, 1)]),
                     "grasps": len(own),
                     **{name: int(has[own].sum()) for name, has in self.labels.items()},
                     "hits": Counter(hits).most_common(),
