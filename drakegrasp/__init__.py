@@ -10,7 +10,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drakegrasp.api.building import build_clutter, build_dataset, make_benchmark
+    from drakegrasp.api.building import (
+        build_clutter,
+        build_dataset,
+        make_benchmark,
+        make_clutter_benchmark,
+    )
     from drakegrasp.api.predicting import predict_scenes
     from drakegrasp.api.scoring import score
     from drakegrasp.api.verifying import (
@@ -95,6 +100,7 @@ _HOMES = {
     "load_hand": "hand.description",
     "load_scene": "dataset.clutter",
     "make_benchmark": "api.building",
+    "make_clutter_benchmark": "api.building",
     "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",
@@ -151,6 +157,7 @@ __all__ = [
     "load_hand",
     "load_scene",
     "make_benchmark",
+    "make_clutter_benchmark",
     "make_posture",
     "pack_grasp",
     "place_object",

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 from drakegrasp.cluster.connect import Workers, dashboard_line, joined
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
@@ -17,7 +17,7 @@ from drakegrasp.cluster.wire import by_wire
 from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.config import BUILD_PRESET, Config
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, MANIFEST_FILE
+from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, CLUTTER_FILE, MANIFEST_FILE
 from drakegrasp.errors import DataError, GraspError, MeshError, counted, listed
 from drakegrasp.exchange.attempts import read_attempts
 from drakegrasp.foreign_files import validate_local
@@ -34,7 +34,9 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.objects.surroundings import Surroundings, load_surroundings
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.scoring import clutter_benchmark
 from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
+from drakegrasp.scoring.clutter_benchmark import ClutterFacts
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.attempts import GraspTable, unknown_objects
 
@@ -281,6 +283,38 @@ def make_benchmark(
             meshes = find_meshes(write_objects(folder, config, only=only, progress=report))
         sources = [source for source in meshes if source.name in names]
         return build(directory, sources, execute, pool=pool, show=show)
+
+
+def make_clutter_benchmark(
+    out: str | Path,
+    *,
+    client: Client | None = None,
+    show: bool = True,
+    **workers: Unpack[Workers],
+) -> tuple[ClutterFacts, bool]:
+    """Build the frozen benchmark `drakegrasp-clutter-1`; the same as `bench-set --clutter`.
+
+    The same call continues.
+
+    Args:
+        out: Directory of the benchmark, a dataset with a clutter.hdf5.
+        client: A Dask client whose workers do the work, e.g. from `connect`.
+        show: Whether to show progress on standard error.
+        workers: The arguments of `connect`, instead of a client; one process per core if neither
+            is given.
+
+    Returns:
+        What identifies its scenes, and whether they are the published ones.
+
+    Raises:
+        ConfigError, DataError, MachineError: As `build_dataset`.
+    """
+    with joined(client, workers) as running:
+        about: dict[str, Any] = {"client": running, "show": show}
+        build_dataset(BUILTIN, out, config=load_config(clutter_benchmark.PRESET), **about)
+        build_clutter(out, **clutter_benchmark.SCENES, **about)
+    found = clutter_benchmark.facts_of(Path(out) / CLUTTER_FILE)
+    return found, found == clutter_benchmark.published()
 
 
 def build_clutter(

@@ -138,8 +138,8 @@ class What:
     Attributes:
         objects: A directory of .obj, .stl, .ply or .glb files, or the built-in objects.
         out: Directory of the dataset. The same command continues an interrupted build.
-        config: Configuration: a file, or the preset paper, released, fast, randomized or bench1.
-            [default: fast]
+        config: Configuration: a file, or the preset paper, released, fast, randomized, bench1 or
+            clutter1. [default: fast]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
         samples: Stop when all objects together have N samples; a larger N continues the build.
         samples_per_object: Stop an object when it has N samples. [default: 20, with fast and

@@ -190,6 +190,7 @@ def bench_set(
     *,
     only: Annotated[tuple[str, ...], Parameter(metavar="NAME")] = (),
     overrides: Settings = (),
+    clutter: bool = False,
     quiet: bool = False,
     workers: Workers = Workers(),
 ) -> None:
@@ -204,9 +205,17 @@ def bench_set(
         out: Directory of the benchmark.
         only: Build this object only; may be given several times.
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
+        clutter: Build drakegrasp-clutter-1 instead: 60 scenes of several objects.
         quiet: Show no progress.
     """
     on = workers.asked()
+    if clutter:
+        if only or overrides:
+            raise UsageError("--clutter must be given without --only and --set")
+        found, same = dg.make_clutter_benchmark(out, **on, show=not quiet)
+        say(f"{counted(found.scenes, 'scene')}, {counted(found.grasps, 'grasp')}")
+        say("as published" if same else "not as published: another CPU, or other versions")
+        return
     print_report(dg.make_benchmark(out, only=only, overrides=overrides, **on, show=not quiet))
 
 

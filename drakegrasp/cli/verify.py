@@ -55,8 +55,8 @@ class Target:
             postures needs --object. [default: object; with --dataset camera; for postures as the
             file specifies]
         hand: The hand. [default: that of the configuration]
-        config: Configuration: a file, or the preset paper, released, fast, randomized or bench1.
-            [default: that of the dataset, else the defaults]
+        config: Configuration: a file, or the preset paper, released, fast, randomized, bench1 or
+            clutter1. [default: that of the dataset, else the defaults]
         overrides: Change one setting, e.g. lift.hold_time=1; may be given several times.
     """
 

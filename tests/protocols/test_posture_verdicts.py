@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from helpers.commands import error_line, run
 from helpers.jaws import HERE, jaws
-from helpers.tables import FOLDER
 
 from drakegrasp.errors import ConfigError, DataError, HandError, MachineError
 from drakegrasp.exchange.dexgraspbench import write_object
@@ -29,8 +28,44 @@ from drakegrasp.protocols.postures import (
 from drakegrasp.protocols.protocol import find_protocol
 from drakegrasp.protocols.scene import read_object_folder
 
-#: Python of a user: a protocol that runs, and some that do not.
-OWN = (FOLDER / "own_protocols.txt").read_text(encoding="utf-8")
+OWN = """
+from dataclasses import dataclass, replace
+
+from drakegrasp.protocols.protocol import MujocoProtocol
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weak(MujocoProtocol):
+    '''Pushes too weak to matter.'''
+
+    name: str = "weak"
+    source: str = "a test"
+    acceleration: float = 0.1
+    friction: tuple[float, float] = (0.1, 0.0)
+
+
+class Broken(Weak):
+    def run(self, scene, motion):
+        return 1 / 0
+
+
+class Wordless(Weak):
+    def run(self, scene, motion):
+        return True
+
+
+class Heavy(Weak):
+    density = 500.0
+
+
+class Nameless(MujocoProtocol):
+    acceleration = 0.1
+
+
+class Stranger:
+    def run(self, scene, motion):
+        return None
+"""
 
 Write = Callable[..., Path]
 
