@@ -63,6 +63,8 @@ from drakegrasp.vision.rendering import build_renderer, outline_sizes, render
 
 #: Number of piles of a set of objects before the next set is tried.
 PILES = 5
+#: Computing time after which the objects of a scene are considered to hang while they settle [s].
+STAGE_SECONDS = 600.0
 #: An attempt hangs if it takes this many times its limit of computing time.
 HANG_FACTOR = 1.5
 #: Last numbers of the streams of a scene: its objects, the grasps to try, and the first pile.
@@ -173,7 +175,8 @@ class _Scene:
 
     def __init__(self, task: ClutterTask, journal: Journal) -> None:
         self._task, self._config, self._journal = task, task.config, journal
-        self._objects, self._clutter = _settled(task)
+        with journal.step("settle", STAGE_SECONDS):
+            self._objects, self._clutter = _settled(task)
         self._models, self._X_TN = self._clutter.models, self._clutter.X_TO
         self.grasps = self._label_grasps()
 

@@ -182,3 +182,14 @@ def test_a_neighbour_with_points_that_are_almost_equal_can_be_there(
     )
     around = Neighbourhood(models=(doubled,), X_TN=make_pose(UP, [0.5, 0.0, 0.02])[None])
     assert scene_of(cube, config, hand, around).neighbours
+
+
+def test_neighbours_and_walls_move_together(brick: ObjectModel) -> None:
+    wall = Box(size=np.array([0.5, 0.02, 0.3]), X_TB=make_pose(UP, [0.0, 0.2, 0.15]))
+    around = Neighbourhood(
+        models=(brick,), X_TN=make_pose(UP, [0.1, 0.0, 0.02])[None], boxes=(wall,)
+    )
+    moved = around.moved(make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2.0), [0.3, 0.0, 0.0]))
+    np.testing.assert_allclose(moved.X_TN[0, :3, 3], [0.3, 0.1, 0.02], atol=1e-12)
+    np.testing.assert_allclose(moved.boxes[0].X_TB[:3, 3], [0.1, 0.0, 0.15], atol=1e-12)
+    np.testing.assert_allclose(moved.boxes[0].X_TB[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
