@@ -153,7 +153,7 @@ def test_file_that_was_replaced_is_refused(out: Path) -> None:
 def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
     """Numbers of outcomes and removals that have left stand for nothing, too."""
     edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 16, "u1")))
-    with pytest.raises(DataError, match=r"/outcome must be one of 0, 1, .*, 18, got 16 in row 7"):
+    with pytest.raises(DataError, match=r"/outcome must be one of 0, 1, .*, 19, got 16 in row 7"):
         Trials(out)[[7, 9]]["outcome"]
     edit_file(out / TRIALS, lambda f: f["successes/removal"].write_direct(np.full(9, 14, "u1")))
     with pytest.raises(

@@ -333,7 +333,7 @@ def test_fingers_are_opened_until_the_hand_is_clear(held, cube, monkeypatch, col
     """By the whole margin, then by half of it."""
     opened, ends = [], iter([Outcome.START_COLLISION] * collisions + [Outcome.SUCCESS])
 
-    def run(model, X_TO, attempt, config):
+    def run(model, X_TO, attempt, config, around):
         opened.append(attempt.closing)
         return TrialRecord(outcome=next(ends), X_TO=X_TO, X_OG=attempt.X_OG)
 
