@@ -37,14 +37,17 @@ Place = tuple[str | int, ...]
 def some_values(tree: Any, each: int) -> Iterator[Kind]:
     """Yield one in so many ways to spoil or leave out a value of a tree.
 
-    With a prime number of them all ways have their turn.
+    With a prime number of them all ways have their turn. A value that is there already is no way.
     """
-    return islice(_every_value(tree, ()), 0, None, each)
+    return (kind for kind in islice(_every_value(tree, ()), 0, None, each) if kind is not None)
 
 
-def _every_value(tree: Any, place: Place) -> Iterator[Kind]:
+def _every_value(tree: Any, place: Place) -> Iterator[Kind | None]:
     for key, value in list(tree.items() if isinstance(tree, dict) else enumerate(tree)):
-        yield from (without((*place, key)), *ways((*place, key), *VALUES))
+        yield without((*place, key))
+        for name, other in VALUES.items():
+            same = type(other) is type(value) and other == value
+            yield None if same else value_kind((*place, key), name, other)
         if isinstance(value, dict | list):
             yield from _every_value(value, (*place, key))
 
