@@ -27,9 +27,7 @@ from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manife
 from drakegrasp.dataset.paths import CLUTTER_FILE, clutter_path
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.scenes import GRASPS_FOLLOW_FROM, count_scenes
-from drakegrasp.dataset.schema import (
-    SCENE_TABLES,
-)
+from drakegrasp.dataset.schema import SCENE_TABLES
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.generation.clutter_scene import IMAGES, OBJECTS, ClutterTask, make_scene
@@ -71,7 +69,7 @@ class ClutterRequest:
     tries: int = 10
 
     def validate(self) -> None:
-        """Raise a ConfigError if a number is not possible."""
+        """Raise a ConfigError if a number or the names of the surroundings are not possible."""
         low, high = self.objects
         for name, value, least in (("scenes", self.scenes, 1), ("tries", self.tries, 0)):
             if value < least:
@@ -79,6 +77,13 @@ class ClutterRequest:
         if not 1 <= low <= high <= MOST_OBJECTS:
             raise ConfigError(
                 f"objects must be a range within 1 to {MOST_OBJECTS}, got {low}..{high}"
+            )
+
+        # The file knows what is around a scene by its name.
+        names = [each.name for each in self.surroundings]
+        if not names or len(set(names)) < len(names):
+            raise ConfigError(
+                f"surroundings must have different names, got {', '.join(names) or 'none'}"
             )
 
     def stored(self) -> dict[str, Any]:

@@ -123,12 +123,13 @@ class Neighbourhood:
         return replace(self, X_TN=multiply(X, self.X_TN), boxes=boxes)
 
     def digest(self) -> str:
-        """Return a hash of meshes, masses and poses."""
+        """Return a hash of meshes, masses, inertias, frictions and poses."""
         parts: list[Any] = [self.X_TN]
         for box in self.boxes:
             parts += [box.size, box.X_TB]
         for model in self.models:
             parts += [model.collision_vertices, model.collision_faces, np.float64(model.mass)]
+            parts += [model.p_OOcm, model.I_OOcm_O, np.array(str(model.friction).encode())]
         content = hashlib.sha256()
         for part in parts:
             content.update(np.ascontiguousarray(part).tobytes())

@@ -95,6 +95,11 @@ def test_labels_of_geometry_and_of_trials_agree_with_each_other(cluttered: Path)
     [
         (asked(scenes=0), "scenes must be at least 1, got 0"),
         (asked(tries=-1), "tries must be at least 0, got -1"),
+        (
+            ClutterRequest(surroundings=[load_surroundings("bin")] * 2),
+            "surroundings must have different names, got bin, bin",
+        ),
+        (ClutterRequest(surroundings=[]), "surroundings must have different names, got none"),
         (asked(low=3, high=2), r"objects must be a range within 1 to 20, got 3\.\.2"),
     ],
 )
