@@ -1,16 +1,15 @@
 """From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
 
-Input: a directory whose work units are all done. Output: the three files, all or none.
-`survey` verifies the seals of the shards, counts their rows, reads the successes, and decides which
-of them become samples, in which split. Then the rows go from the shards into the files, some
-thousand at a time. This process keeps a few numbers per success, whatever the number of attempts.
-It does not import Drake.
+Input: a directory whose work units are all done, and their summaries, or the shards from which
+these are read. Output: the three files, all or none. `survey` decides which successes become
+samples, in which split. Then the rows go from the shards into the files, some thousand at a time.
+This process keeps a few numbers per success, whatever the number of attempts. It does not import
+Drake.
 """
 
 from __future__ import annotations
 
 import hashlib
-from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,9 +33,7 @@ from drakegrasp.dataset.hdf5 import (
     open_samples,
     open_trials,
     packed_chunk,
-    read_codes,
     read_columns,
-    sizes_in,
     write_field,
 )
 from drakegrasp.dataset.lock import build_lock
@@ -69,7 +66,7 @@ from drakegrasp.dataset.schema import (
 )
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard
 from drakegrasp.dataset.split import find_homes, split_samples
-from drakegrasp.dataset.successes import judge_successes, shard_successes, successes_of
+from drakegrasp.dataset.successes import UnitSummary, judge_successes, read_summary
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Flags, Removal
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, unpack_pose
@@ -141,35 +138,21 @@ def assemble(
         read_manifest(out)
     with build_lock(out):
         manifest = with_postprocessing(read_manifest(out), overrides)
-        return assemble_locked(out, manifest, rejected=rejected, progress=progress)
+        surveyed = survey(out, manifest, rejected=rejected, progress=progress)
+        return assemble_locked(out, surveyed, progress=progress)
 
 
-def assemble_locked(
-    out: Path,
-    manifest: Manifest,
-    *,
-    rejected: Sequence[int | AttemptKey] | None = None,
-    known: Mapping[ShardHeader, Table] | None = None,
-    surveyed: Survey | None = None,
-    progress: Report = silent,
-) -> Assembly:
+def assemble_locked(out: Path, surveyed: Survey, *, progress: Report = silent) -> Assembly:
     """Write the three files and the manifest; the caller holds the lock.
 
     Args:
         out: Directory of the dataset.
-        manifest: Manifest of the dataset; its filters and split may differ from those on disk.
-        rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
-        known: The successes of each shard, see `survey`.
-        surveyed: The survey of the shards, if there is one already.
+        surveyed: The survey of its shards; its filters and split may differ from those on disk.
         progress: As for `assemble`.
     """
+    manifest, successes = surveyed.manifest, surveyed.successes
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
-        # Decide which successes become samples, and in which split.
-        if surveyed is None:
-            surveyed = survey(out, manifest, known, rejected=rejected, progress=progress)
-        manifest, successes = surveyed.manifest, surveyed.successes
-
         # Write the small tables, and allocate all rows.
         paths = {camera: new(name) for camera, name in {"": TRIALS_FILE, **DATA_FILES}.items()}
         with ExitStack() as stack:
@@ -189,24 +172,7 @@ def assemble_locked(
 
         # The manifest, with filters, split and rejections, changes together with the files.
         new(MANIFEST_FILE).write_bytes(manifest_text(manifest))
-    return summarise(out)
-
-
-def summarise(out: Path) -> Assembly:
-    """Return the numbers of rows in the files of a dataset.
-
-    Raises:
-        DataError: If the files are missing or damaged.
-    """
-    with open_trials(out / TRIALS_FILE) as trials, open_samples(out / DATA_FILES["oto"]) as data:
-        removal = read_codes(trials["successes/removal"], list(Removal))
-        reasons, counts = np.unique(removal, return_counts=True)
-        return Assembly(
-            trials=len(trials["trials/outcome"]),
-            grasps=len(removal),
-            removed={Removal(int(r)): int(n) for r, n in zip(reasons, counts, strict=True)},
-            samples={split: len(data[split]["trial_id"]) for split in SPLITS},
-        )
+    return surveyed.assembly
 
 
 def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[str, Any]:
@@ -288,6 +254,7 @@ class Survey:
         samples: For each split the ids of the trials that are samples, in rising order.
         sizes: Lengths of the letters in the shapes of the fields.
         seals: Hash of the seals of the shards, see `shards_sha256`.
+        has_read: Whether the survey has read the shards, and so verified them.
     """
 
     manifest: Manifest
@@ -296,17 +263,29 @@ class Survey:
     samples: Mapping[str, npt.NDArray[np.int64]]
     sizes: Mapping[str, int]
     seals: str
+    has_read: bool
 
     @property
     def count(self) -> int:
         """Number of rows of /trials."""
         return self.shards[-1].first + self.shards[-1].count
 
+    @property
+    def assembly(self) -> Assembly:
+        """Numbers of rows in the files."""
+        removal = Counter(self.successes["removal"].tolist())
+        return Assembly(
+            trials=self.count,
+            grasps=self.successes.count,
+            removed={Removal(reason): removal[reason] for reason in sorted(removal)},
+            samples={split: len(self.samples[split]) for split in SPLITS},
+        )
+
 
 def survey(
     out: Path,
     manifest: Manifest,
-    known: Mapping[ShardHeader, Table] | None = None,
+    known: Mapping[ShardHeader, UnitSummary] | None = None,
     *,
     rejected: Sequence[int | AttemptKey] | None = None,
     progress: Report = silent,
@@ -316,8 +295,7 @@ def survey(
     Args:
         out: Directory of the dataset.
         manifest: Its manifest, with filters and split.
-        known: The successes of each shard, as `successes_of` returns them; None: they are read
-            from the shards.
+        known: The summaries of its work units; None: they are read from the shards.
         rejected: As for `assemble`; if None, the rejections of the manifest that are successes.
         progress: Called with the number of surveyed shards and twice the number of all.
 
@@ -325,35 +303,31 @@ def survey(
         DataError: If a shard is missing or damaged, no object has a palm pose, or a rejected trial
             is not a success.
     """
-    headers, letters = list(manifest.headers()), dict[str, int]()
+    headers, seals = list(manifest.headers()), dict[ShardHeader, bytes]()
     numbers = {entry.name: i for i, entry in enumerate(manifest.objects)}
     shards, tables, first = list[ShardRows](), list[Table](), 0
     for header in headers:
         i = numbers[header.object_name]
-        with open_shard(header.path(out), header) as file:
-            # The rows end with the last palm pose that the dataset takes. So a dataset does not
-            # depend on how many more attempts the workers had begun.
-            palms, tried = file["trials/candidate"][:], manifest.objects[i].tried
-            count = len(palms) if tried is None else int(np.count_nonzero(palms < tried))
-            if known is None:
-                successes = successes_of(shard_successes(file), manifest.config)
-            else:
-                successes = known[header]
-            if not letters:
-                letters = sizes_in(file["trials"], TRIAL_FIELDS)
-                letters |= sizes_in(file["looks"], LOOK_FIELDS)
-        successes = successes[successes["trial_id"] < count]
+        unit = known[header] if known else read_summary(out, header, manifest.config)
+
+        # The rows end with the last palm pose that the dataset takes. So a dataset does not depend
+        # on how many more attempts the workers had begun.
+        tried = manifest.objects[i].tried
+        palms = None if tried is None else tried - header.start
+        count = int(unit.attempts[:palms].sum())
+        successes = unit.successes[unit.successes["trial_id"] < count]
         own = np.full(successes.count, i, dtype=np.int32)
         ids = first + successes["trial_id"]
         tables.append(successes.with_columns(object=own, trial_id=ids))
         shards.append(ShardRows(header, i, first, count))
+        seals[header] = unit.seal
         first += count
         progress(len(shards), 2 * len(headers))
     if not shards:
         raise DataError(f"{out}: no object has a palm pose to try")
 
     # Decide about the successes.
-    successes, seals = join(tables), shards_sha256(out, manifest)
+    successes = join(tables)
     by_key = _ids_by_key(manifest, successes)
     if rejected is not None:
         manifest = replace(manifest, rejected=find_keys(rejected, by_key, out))
@@ -366,8 +340,9 @@ def survey(
         shards=shards,
         successes=successes.with_columns(removal=removal),
         samples=samples,
-        sizes=letters,
-        seals=seals,
+        sizes=unit.sizes,
+        seals=shards_sha256(out, manifest, seals),
+        has_read=not known,
     )
 
 
@@ -418,32 +393,38 @@ def _split(manifest: Manifest, samples: Table) -> tuple[Manifest, dict[str, npt.
     return manifest, {name: samples["trial_id"][own] for name, own in rows.items()}
 
 
-def shards_sha256(out: Path, manifest: Manifest) -> str:
+def shards_sha256(
+    out: Path, manifest: Manifest, known: Mapping[ShardHeader, bytes] | None = None
+) -> str:
     """Return a hash of the seals of all shards that the files are made from, hexadecimal.
 
-    The seals are not verified.
+    Args:
+        out: Directory of the dataset.
+        manifest: Its manifest.
+        known: The seal of each shard; None: they are read, and not verified.
 
     Raises:
         DataError: If a shard is missing.
     """
     whole = hashlib.sha256()
     for headers in filter(None, manifest.headers_by_object()):
-        seals = b"".join(read_seal(header.path(out)) for header in headers)
-        whole.update(hashlib.sha256(seals).digest())
+        seals = (known[header] if known else read_seal(header.path(out)) for header in headers)
+        whole.update(hashlib.sha256(b"".join(seals)).digest())
     return whole.hexdigest()
 
 
-def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
+def is_assembled(out: Path, manifest: Manifest, seals: str | None = None) -> bool:
     """Return whether the three files exist and are what assembling would write now.
 
     Args:
         out: Directory of the dataset.
-        verify_shards: Whether to compare the shards as well, which opens each of them.
+        manifest: Its manifest.
+        seals: Hash of the seals of its shards, see `shards_sha256`; None: they are not compared.
 
     Raises:
-        DataError: If a file stores values outside of itself, or a shard is missing.
+        DataError: If a file stores values outside of itself.
     """
-    manifest, stored = read_manifest(out), set[tuple[str, str]]()
+    stored = set[tuple[str, str]]()
     try:
         for name in ASSEMBLED_FILES:
             with open_hdf5(out / name) as file:
@@ -451,8 +432,7 @@ def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     except (OSError, KeyError):
         return False
     signatures, shards = map(set, zip(*stored, strict=True))
-    current = signatures == {manifest.signature()}
-    return current and (not verify_shards or shards == {shards_sha256(out, manifest)})
+    return signatures == {manifest.signature()} and (seals is None or shards == {seals})
 
 
 def validate_assembled(out: Path) -> None:
@@ -461,7 +441,7 @@ def validate_assembled(out: Path) -> None:
     Raises:
         DataError: If it is rejected.
     """
-    if is_assembled(out):
+    if is_assembled(out, read_manifest(out)):
         return
     for name in ASSEMBLED_FILES:
         with open_trials(out / name) if name == TRIALS_FILE else open_samples(out / name):
@@ -502,55 +482,53 @@ def _write_rows(
         files: For each camera its open data file; for the key "" the file of the trials.
         progress: As for `assemble`.
     """
-    shards, count = surveyed.shards, surveyed.count
-    firsts = [shard.first for shard in shards]
-    written: Counter[Place] = Counter()
+    shards, trials, group = surveyed.shards, list[Table](), files[""]["trials"]
+    samples, written = defaultdict[Place, list[_Samples]](list), Counter[Place]()
+    start, chunk = 0, group["trial_id"].chunks[0]
     with ThreadPoolExecutor(available_cores()) as pool:
-        for start in range(0, count, BLOCK):
-            # From the shard in which the block begins to the shard in which it ends.
-            stop = min(start + BLOCK, count)
-            last = bisect_left(firsts, stop)
-            own = shards[bisect_right(firsts, start) - 1 : last]
-            trials, samples = _read_block(out, surveyed, own, start, stop)
+        for done, shard in enumerate(shards, 1):
+            rows, parts = _read_rows(out, surveyed, shard)
+            trials.append(rows)
+            for place, part in parts.items():
+                samples[place].append(part)
+            is_last, count = done == len(shards), shard.first + shard.count - start
+            if count < BLOCK and not is_last:
+                continue
 
-            _write_chunks(files[""]["trials"], trials, start, pool)
+            # Write the full chunks; copies of the other rows begin the next block.
+            block, whole = join(trials), count if is_last else count - count % chunk
+            _write_chunks(group, block[:whole], start, pool)
+            trials, start = [join([block[whole:]])], start + whole
             for place in product(surveyed.samples, CAMERAS):
                 split, camera = place
-                if parts := samples.get(place):
-                    group, first = files[camera][split], written[place]
-                    written[place] += _write_samples(group, parts, first, surveyed.manifest)
-            progress(len(shards) + last, 2 * len(shards))
+                if own := samples.pop(place, None):
+                    data, first = files[camera][split], written[place]
+                    written[place] += _write_samples(data, own, first, surveyed.manifest)
+            progress(len(shards) + done, 2 * len(shards))
 
 
-def _read_block(
-    out: Path, surveyed: Survey, shards: Sequence[ShardRows], start: int, stop: int
-) -> tuple[Table, dict[Place, list[_Samples]]]:
-    """Return the rows `start` to `stop` - 1 of /trials, and the samples among them.
-
-    The seals are not verified here, since the survey has verified them.
-    """
-    tables, samples = list[Table](), defaultdict[Place, list[_Samples]](list)
+def _read_rows(
+    out: Path, surveyed: Survey, shard: ShardRows
+) -> tuple[Table, dict[Place, _Samples]]:
+    """Return the rows of /trials that are taken from a shard, and the samples among them."""
+    header, samples = shard.header, dict[Place, _Samples]()
     names = [f.name for f in _fields(surveyed.manifest, TRIAL_FIELDS)]
-    for shard in shards:
-        header = shard.header
-        with open_shard(header.path(out), header, verify_seal=False) as file:
-            stored = [name for name in names if name not in ASSEMBLED_FIELDS]
-            trials = read_columns(file["trials"], TRIAL_FIELDS, stored)
-            trials = trials.with_columns(
-                trial_id=shard.first + np.arange(trials.count, dtype=np.int64),
-                object=np.full(trials.count, shard.object, dtype=np.int32),
-            )
-            first, last = max(start, shard.first), min(stop, shard.first + shard.count)
-            tables.append(trials[first - shard.first : last - shard.first])
+    stored = [name for name in names if name not in ASSEMBLED_FIELDS]
+    with open_shard(header.path(out), header, verify=not surveyed.has_read) as (file, _):
+        trials = read_columns(file["trials"], TRIAL_FIELDS, stored)
+        trials = trials[: shard.count].with_columns(
+            trial_id=shard.first + np.arange(shard.count, dtype=np.int64),
+            object=np.full(shard.count, shard.object, dtype=np.int32),
+        )
 
-            # The samples of these rows, for each camera.
-            for split, ids in surveyed.samples.items():
-                own = ids[slice(*np.searchsorted(ids, (first, last)))]
-                for camera in CAMERAS if len(own) else ():
-                    model = _load(model_path(out, header.object_name))
-                    part = _samples_of(file["looks"], trials, own - shard.first, model, camera)
-                    samples[split, camera].append(part)
-    return join(tables), samples
+        # The samples of these rows, for each camera.
+        for split, ids in surveyed.samples.items():
+            own = ids[slice(*np.searchsorted(ids, (shard.first, shard.first + shard.count)))]
+            for camera in CAMERAS if len(own) else ():
+                model = _load(model_path(out, header.object_name))
+                rows = own - shard.first
+                samples[split, camera] = _samples_of(file["looks"], trials, rows, model, camera)
+    return trials, samples
 
 
 #: The shards of an object follow each other.

@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +36,7 @@ from drakegrasp.dataset.schema import (
 )
 from drakegrasp.errors import DataError, first_line, printable
 from drakegrasp.foreign_files import parse_json, validate_regular
+from drakegrasp.runtime.files import SEAL_SIZE, open_sealed
 from drakegrasp.table import AnyArray as AnyArray
 from drakegrasp.table import Table
 
@@ -54,7 +56,9 @@ COLUMN_CHUNK = 2048
 # Files
 
 
-def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
+def open_hdf5(
+    path: Path, *, again: bool = False, content: BufferedReader | None = None
+) -> h5py.File:
     """Open a file of a dataset for reading; the caller closes it.
 
     An untrusted file may use links or external storage, or claim rows that it does not hold. Our
@@ -63,6 +67,7 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     Args:
         path: Path of the file.
         again: Whether the same work has opened the file before; then it is not searched for these.
+        content: The file, if it is open already.
 
     Raises:
         OSError: If the file cannot be read.
@@ -71,7 +76,7 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     """
     validate_regular(path)
     try:
-        file = h5py.File(path, "r")
+        file = h5py.File(content or path, "r")
     except OSError as error:
         if "unable to lock file" not in str(error):
             raise
@@ -139,13 +144,16 @@ def _find_elsewhere(file: h5py.File) -> str | None:
 
 
 @contextmanager
-def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]:
+def opened(
+    path: Path, what: str, *, again: bool = False, content: BufferedReader | None = None
+) -> Iterator[h5py.File]:
     """Open an HDF5 file while the block runs; HDF5 errors in the block become a DataError.
 
     Args:
         path: Path of the file.
         what: What the file must be, in words.
         again: See `open_hdf5`.
+        content: See `open_hdf5`.
 
     Raises:
         DataError: If the file is missing or damaged.
@@ -153,7 +161,7 @@ def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]
     if path.is_dir():
         raise DataError(f"{path}: must be {what}, got a folder; name the file in it")
     try:
-        with open_hdf5(path, again=again) as file:
+        with open_hdf5(path, again=again, content=content) as file:
             yield file
     except DataError:
         raise
@@ -161,6 +169,26 @@ def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]
         if not says_damage(error):
             raise
         raise DataError(f"{path}: must be {what}, got none ({first_line(error)})") from None
+
+
+@contextmanager
+def opened_sealed(
+    path: Path, what: str, *, verify: bool = True
+) -> Iterator[tuple[h5py.File, bytes]]:
+    """Open a sealed file once, to verify and to read it; yield it and its seal.
+
+    Args:
+        path: Path of the file.
+        what: What the file is, in words.
+        verify: Whether to verify the seal first: an intact file is as it was written.
+
+    Raises:
+        DataError: If the file is missing, or a bit of it has changed.
+    """
+    with open_sealed(path, what, verify=verify) as content:
+        seal = content.read(SEAL_SIZE)
+        with opened(path, f"a complete {what}", again=not verify, content=content) as file:
+            yield file, seal
 
 
 class Difference(NamedTuple):

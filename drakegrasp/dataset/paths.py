@@ -5,11 +5,10 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from drakegrasp.dataset.hdf5 import opened
+from drakegrasp.dataset.hdf5 import opened_sealed
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import NAME_RULE, is_name, read_content
-from drakegrasp.runtime.files import validate_seal
 
 #: Files of all attempts, of samples by camera and of scenes, and the manifest.
 TRIALS_FILE = "trials.hdf5"
@@ -87,9 +86,7 @@ def recorded_model(out: Path, name: str) -> str:
     Raises:
         DataError: If the plan is missing or has changed.
     """
-    path = plan_path(out, name)
-    validate_seal(path, "plan of an object")
-    with opened(path, "the plan of an object") as file:
+    with opened_sealed(plan_path(out, name), "plan of an object") as (file, _):
         return str(file.attrs["model_sha256"])
 
 

@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.hdf5 import AnyArray, opened
+from drakegrasp.dataset.hdf5 import AnyArray, opened_sealed
 from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry
 from drakegrasp.dataset.paths import model_path, plan_path, read_model_file
 from drakegrasp.errors import DataError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
-from drakegrasp.runtime.files import atomic_hdf5, validate_seal
+from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.table import Table
 
@@ -139,8 +139,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     path = plan_path(out, name)
 
     # Both files must be unchanged, and belong to this configuration.
-    validate_seal(path, "plan of an object")
-    with opened(path, "the plan of an object") as file:
+    with opened_sealed(path, "plan of an object") as (file, _):
         attributes = dict(file.attrs)
         resting, palms = ({name: file[name][:] for name in names} for names in (_RESTING, _PALMS))
         given = {name: file[name][:] for name in (*_POSTURES, "preshape") if name in file}

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import AnyArray, opened, write_fixed
+from drakegrasp.dataset.hdf5 import AnyArray, opened_sealed, write_fixed
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
@@ -24,7 +25,7 @@ from drakegrasp.dataset.schema import (
     validate_schema_version,
 )
 from drakegrasp.errors import DataError
-from drakegrasp.runtime.files import atomic_hdf5, validate_seal
+from drakegrasp.runtime.files import FORMAT, SEAL_SIZE, write_sealed
 
 #: Fields of `/trials` that are known for the whole dataset only; shards do not have them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
@@ -95,11 +96,11 @@ def trial_columns() -> tuple[Field, ...]:
     return tuple(f for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS and f.derive is None)
 
 
-def write_shard(out: Path, shard: Shard) -> Path:
-    """Write a shard into a dataset's directory and return its path."""
-    path = shard.header.path(out)
+def write_shard(out: Path, shard: Shard) -> bytes:
+    """Write a shard into a dataset's directory and return its seal."""
     tables = (("trials", trial_columns(), shard.trials), ("looks", LOOK_FIELDS, shard.looks))
-    with atomic_hdf5(path, sealed=True) as file:
+    content = BytesIO()
+    with h5py.File(content, "w", userblock_size=SEAL_SIZE, libver=FORMAT) as file:
         file.attrs.update(shard.header.stored)
         file.attrs["schema_version"] = SCHEMA_VERSION
         for name, fields, columns in tables:
@@ -108,31 +109,30 @@ def write_shard(out: Path, shard: Shard) -> Path:
                 if field.optional and field.name not in columns:
                     continue
                 write_fixed(group, field, np.asarray(columns[field.name]))
-    return path
+    return write_sealed(shard.header.path(out), content)
 
 
 @contextmanager
-def open_shard(path: Path, header: ShardHeader, *, verify_seal: bool = True) -> Iterator[h5py.File]:
-    """Open a shard for reading while the block runs.
+def open_shard(
+    path: Path, header: ShardHeader, *, verify: bool = True
+) -> Iterator[tuple[h5py.File, bytes]]:
+    """Open a shard for reading while the block runs; yield it and its seal.
 
     Args:
         path: Path of the file.
         header: Identity that the shard must have.
-        verify_seal: Whether to verify the seal first, which reads the whole file: an intact shard
-            is as it was written.
+        verify: Whether to verify the seal first, which reads the whole file.
 
     Raises:
         DataError: If the file is missing or truncated, if a single bit of it has changed, or if it
             belongs to another schema, configuration, mesh or range; the message names the file and
             the reason.
     """
-    if verify_seal:
-        validate_seal(path)
-    with opened(path, "a complete shard", again=not verify_seal) as file:
+    with opened_sealed(path, "shard", verify=verify) as (file, seal):
         validate_schema_version(path, file.attrs.get("schema_version"))
 
         # Check the identity: a file may have been copied to the path of another unit.
         own = ShardHeader(**{name: file.attrs[name] for name in header.stored})
         if own.stored != header.stored:
             raise DataError(f"{path}: must be a shard of {header.label}, got one of {own.label}")
-        yield file
+        yield file, seal

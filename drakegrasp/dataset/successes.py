@@ -2,15 +2,17 @@
 
 Input: rows of `/trials` and `/looks`. Output: a table with the identity of each attempt, columns of
 its rows, and columns that follow from them. From it follows the `Removal` of each: by our filters,
-user-defined filters, outliers and rejections.
+user-defined filters, outliers and rejections. A `UnitSummary` has this table of a work unit, so
+that its shard is read again only to copy its rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeAlias
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -18,12 +20,14 @@ from drakegrasp import registry
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CameraConfig, Config, FilterConfig, is_own_class
 from drakegrasp.dataset import quality
-from drakegrasp.dataset.hdf5 import AnyArray, read_columns
+from drakegrasp.dataset.hdf5 import AnyArray, read_columns, sizes_in
 from drakegrasp.dataset.schema import CAMERAS, LOOK_FIELDS, TRIAL_FIELDS, with_derived
+from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard
 from drakegrasp.errors import ConfigError, listed
 from drakegrasp.filters import NEEDED, Filter, Flags, Removal, first_removal, is_outlier
 from drakegrasp.frames import Array, invert_pose, unpack_pose
 from drakegrasp.grasp import unused_fingers
+from drakegrasp.outcomes import Outcome
 from drakegrasp.registry import own_class, run_own
 from drakegrasp.table import Table
 from drakegrasp.vision.camera import intrinsics, project
@@ -33,9 +37,9 @@ COPIED = (
     *("candidate", "standoff_index", "resting"),
     *(field.name for field in TRIAL_FIELDS if field.name in NEEDED),
 )
-#: Columns of `/trials` and of `/looks` that `successes_of` reads.
+#: Columns of `/trials` and of `/looks` that `summary_of` reads.
 _OF_TRIALS = (
-    *COPIED,
+    *("outcome", *COPIED),
     *("X_TO", "X_OG", "closed_p_OQ", "closed_nhat_Q_O", "lifted_p_OQ", "lifted_nhat_Q_O"),
     *("closed_touching", "lifted_touching", *quality.COLUMNS),
 )
@@ -43,22 +47,87 @@ _POSES = tuple(f"X_TC_{camera}" for camera in CAMERAS)
 _MASKS = tuple(f"mask_{camera}" for camera in CAMERAS)
 
 
-def shard_successes(file: h5py.File) -> Table:
-    """Return the columns of a shard's successes from which those of `successes_of` follow.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UnitSummary:
+    """What a build and the assembled files need of a work unit before its rows are copied.
 
-    `row` is each success's row of the shard's /trials.
+    Attributes:
+        header: Header of the unit.
+        seal: Seal of its shard.
+        sizes: Lengths of the letters in the shapes of the fields.
+        attempts: (n,), number of attempts at each of its n palm poses.
+        outcomes: Number of attempts by outcome.
+        errors: Number of solver errors by message; empty for a unit that was read.
+        successes: The successes, see `successes_of`; `by_filter` counts user-defined filters, too.
     """
-    looks = read_columns(file["looks"], LOOK_FIELDS, ("row", *_POSES, *_MASKS))
-    trials = read_columns(file["trials"], TRIAL_FIELDS, dict.fromkeys(_OF_TRIALS))[looks["row"]]
-    depth = file["looks/image_otm"][:, 3] if trials.count else np.zeros((0, 1, 1))
-    return trials.with_columns(looks, depth_otm=depth)
+
+    header: ShardHeader
+    seal: bytes
+    sizes: Mapping[str, int]
+    attempts: npt.NDArray[np.int64]
+    outcomes: Mapping[Outcome, int]
+    errors: Mapping[str, int]
+    successes: Table
+
+
+def read_summary(out: Path, header: ShardHeader, config: Config) -> UnitSummary:
+    """Return the summary of a work unit whose shard is in a dataset's directory.
+
+    Raises:
+        DataError: If the shard is missing, damaged or of another unit.
+        ConfigError: If a user-defined filter cannot be run.
+    """
+    with open_shard(header.path(out), header) as (file, seal):
+        trials = read_columns(file["trials"], TRIAL_FIELDS, dict.fromkeys(_OF_TRIALS))
+        looks = read_columns(file["looks"], LOOK_FIELDS, ("row", *_POSES, *_MASKS))
+        depth = file["looks/image_otm"][:, 3] if looks.count else np.zeros((0, 1, 1))
+        sizes = sizes_in(file["trials"], TRIAL_FIELDS) | sizes_in(file["looks"], LOOK_FIELDS)
+    shard = Shard(header=header, trials=trials, looks=looks)
+    return summary_of(shard, seal, sizes, depth, config)
+
+
+def summary_of(
+    shard: Shard,
+    seal: bytes,
+    sizes: Mapping[str, int],
+    depth_otm: AnyArray,
+    config: Config,
+    errors: Mapping[str, int] | None = None,
+) -> UnitSummary:
+    """Return the summary of a work unit, each of whose successes is judged here, once.
+
+    Args:
+        shard: The results of the unit; of its images only the masks are needed.
+        seal: Seal of its file.
+        sizes: Lengths of the letters in the shapes of the fields.
+        depth_otm: (n, S, S), otm depth images of the n successes [m].
+        config: Configuration of the dataset.
+        errors: Number of solver errors by message.
+
+    Raises:
+        ConfigError: If a user-defined filter cannot be run.
+    """
+    header, trials = shard.header, Table(shard.trials)
+    looks = Table(shard.looks).only("row", *_POSES, *_MASKS)
+    rows = trials[looks["row"]].with_columns(looks, depth_otm=depth_otm)
+    outcomes, counts = np.unique(trials["outcome"], return_counts=True)
+    palms = trials["candidate"] - header.start
+    return UnitSummary(
+        header=header,
+        seal=seal,
+        sizes=sizes,
+        attempts=np.bincount(palms, minlength=header.stop - header.start),
+        outcomes={Outcome(o): n for o, n in zip(outcomes.tolist(), counts.tolist(), strict=True)},
+        errors=errors or {},
+        successes=judge_alone(successes_of(rows, config), config.filters),
+    )
 
 
 def successes_of(rows: Mapping[str, AnyArray], config: Config) -> Table:
     """Return what filters and splits need of n successes of a work unit.
 
     `trial_id` is the row in the unit's /trials, `object` is 0, and `by_filter` is the reason of the
-    first filter that rejects the success: it is judged once, here.
+    first filter of ours that rejects the success.
 
     Args:
         rows: Columns of the successes' rows of `/trials` and `/looks`, by their names there;
@@ -150,19 +219,13 @@ def judge_successes(
     """Return the `Removal` (n,) of each success.
 
     Args:
-        successes: The n successes, with the columns of `successes_of`.
+        successes: The n successes, as `judge_alone` returns them.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
         unreachable: (n,), which successes the arm of `config.reachable` does not reach, or was not
             asked for; None without such an arm.
-
-    Raises:
-        ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
     """
-    # Filters that judge each grasp by itself.
     removal = successes["by_filter"].copy()
-    own = _removed_by_own(config, successes)
-    removal[own & (removal == Removal.KEPT)] = Removal.OWN
 
     # Outliers among the remaining grasps of an object that use the same fingers.
     kept = removal == Removal.KEPT
@@ -217,12 +280,15 @@ def own_setting(config: FilterConfig) -> str:
     return f"{_OWN}={value}" if names else ""
 
 
-def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
-    """Return which successes (n,) are removed by a user-defined filter."""
-    due = (successes.count,)
-    removed = np.zeros(due, dtype=np.bool_)
+def judge_alone(successes: Table, config: FilterConfig) -> Table:
+    """Return successes whose `by_filter` counts the user-defined filters, which are asked here.
+
+    Raises:
+        ConfigError: If a user-defined filter cannot be run, or returns something else than bools.
+    """
+    due, removal = (successes.count,), successes["by_filter"].copy()
     if due == (0,):
-        return removed
+        return successes
     for name, keep in zip(config.own, own_filters(config), strict=True):
         kept = np.asarray(run_own(name, keep, successes))
         if kept.dtype != np.bool_ or kept.shape != due:
@@ -230,16 +296,5 @@ def _removed_by_own(config: FilterConfig, successes: Table) -> Flags:
                 f"{name.partition('@')[0]}: keep must return {due} of bool, "
                 f"got {kept.shape} of {kept.dtype}"
             )
-        removed |= ~kept
-    return removed
-
-
-def find_hits(successes: Table, config: Config) -> tuple[tuple[int, int], ...]:
-    """Return the candidates and stand-offs of the successes that count for a target.
-
-    They pass all filters except the one of outliers, which needs all grasps of an object.
-    """
-    filters = config.filters.model_copy(update={"outlier_sigma": 0.0})
-    successes = successes[judge_successes(successes, filters) == Removal.KEPT]
-    names = ("candidate", "standoff_index")
-    return tuple(zip(*(successes[name].tolist() for name in names), strict=True))
+        removal[~kept & (removal == Removal.KEPT)] = Removal.OWN
+    return successes.with_columns(by_filter=removal)

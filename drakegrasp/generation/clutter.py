@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import opened, read_texts
+from drakegrasp.dataset.hdf5 import opened_sealed, read_texts
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, origin_attributes, read_manifest
 from drakegrasp.dataset.paths import CLUTTER_FILE, clutter_path
@@ -42,7 +42,7 @@ from drakegrasp.generation.scenes import (
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.surroundings import Surroundings
 from drakegrasp.runtime.executor import Executor, run_here
-from drakegrasp.runtime.files import atomic_hdf5, disk_full_named, validate_seal
+from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Draw, Stream
 
@@ -215,9 +215,8 @@ def _assemble(
 
 def _read_scene(path: Path) -> tuple[dict[str, Columns], dict[str, list[bytes]]]:
     """Return the columns and packed images of the file of a scene."""
-    validate_seal(path, "scene")
     tables, images = dict[str, Columns](), dict[str, list[bytes]]()
-    with opened(path, "a scene of several objects") as file:
+    with opened_sealed(path, "scene") as (file, _):
         for name, fields in SCENE_TABLES.items():
             if name not in file:
                 continue

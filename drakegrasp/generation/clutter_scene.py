@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from drakegrasp.arithmetic import Array
 from drakegrasp.dataset.clutter import Clutter
-from drakegrasp.dataset.hdf5 import AnyArray
+from drakegrasp.dataset.hdf5 import AnyArray, opened_sealed
 from drakegrasp.dataset.paths import clutter_path, object_files
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.scenes import TRIED, grasps_of_trials
@@ -44,7 +43,7 @@ from drakegrasp.generation.scenes import (
 from drakegrasp.objects.surroundings import Neighbourhood, Surroundings
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import one_thread
-from drakegrasp.runtime.files import atomic_hdf5, validate_seal
+from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.runtime.journal import ATTEMPT, Journal, Verdict, inject_fault, open_journal
 from drakegrasp.seeding import Draw, Stream
 from drakegrasp.simulation.attempt import Attempt, usual_materials
@@ -163,10 +162,9 @@ def make_scene(task: ClutterTask) -> int:
 def _is_made(path: Path, identity: Mapping[str, Any]) -> bool:
     """Return whether the file of a scene is there, whole and of this request."""
     try:
-        validate_seal(path, "scene")
-        with h5py.File(path) as file:
+        with opened_sealed(path, "scene") as (file, _):
             return all(file.attrs.get(key) == value for key, value in identity.items())
-    except (DataError, OSError):
+    except DataError:
         return False
 
 

@@ -14,7 +14,13 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 
 from drakegrasp.config import CarriedHand, Config
-from drakegrasp.dataset.assemble import Assembly, assemble_locked, is_assembled
+from drakegrasp.dataset.assemble import (
+    Assembly,
+    assemble_locked,
+    is_assembled,
+    shards_sha256,
+    survey,
+)
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -73,13 +79,14 @@ def merge(
             _take_files(out, part, folder)
         manifest = _with_hand(manifest, manifests.values(), folder)
         write_manifest(manifest, folder)
-        return assemble_locked(folder, manifest, progress=progress)
+        surveyed = survey(folder, manifest, progress=progress)
+        return assemble_locked(folder, surveyed, progress=progress)
 
 
 def _read_complete(out: Path) -> Manifest:
     """Return the manifest of a complete dataset."""
     manifest = read_manifest(out)
-    if not is_assembled(out, verify_shards=True):
+    if not is_assembled(out, manifest, shards_sha256(out, manifest)):
         raise DataError(
             f"{out}: must be a complete dataset, got one whose files are not of all its shards; "
             "complete it with `drakegrasp build` or `assemble`"

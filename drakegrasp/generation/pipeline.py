@@ -22,7 +22,6 @@ from drakegrasp.dataset.assemble import (
     Survey,
     assemble_locked,
     is_assembled,
-    summarise,
     survey,
 )
 from drakegrasp.dataset.manifest import (
@@ -35,20 +34,20 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.prepared_objects import with_drawn
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import palms_in_files
+from drakegrasp.dataset.successes import UnitSummary
 from drakegrasp.errors import DataError, GraspError, counted, listed, printable
 from drakegrasp.filters import Removal
 from drakegrasp.frames import unpack_pose
 from drakegrasp.generation.directory import BuildDirectory
 from drakegrasp.generation.prepare import DrawTask, PrepareTask, draw_palms, find_entry, prepare_one
 from drakegrasp.generation.target import Target
-from drakegrasp.generation.work_unit import UnitSummary, WorkUnit, find_tasks, find_units, run_unit
+from drakegrasp.generation.work_unit import WorkUnit, find_tasks, find_units, run_unit
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.attempts import GraspTable, misfits
-from drakegrasp.table import Table
 
 #: Outcomes of attempts that ended because of the machine or an error of the simulator.
 ENDED = (Outcome.CRASHED, Outcome.TIMEOUT)
@@ -217,11 +216,11 @@ class _Build:
         self._execute, self._pool, self._show = execute, pool, show
         self._postures = postures
 
-        # With a target: the palm poses that the dataset had of each object, the grasps that are no
-        # samples by inspection, the successes of each completed unit, and the survey of them all.
+        # The completed units. With a target: the palm poses that the dataset had of each object,
+        # the grasps that are no samples by inspection, and the survey of all units.
+        self._units: dict[ShardHeader, UnitSummary] = {}
         self._floors: dict[str, int] = {}
         self._rejected = set[tuple[str, int, int]]()
-        self._successes: dict[ShardHeader, Table] = {}
         self._survey: Survey | None = None
 
     def run(self, sources: Sequence[MeshSource]) -> BuildReport:
@@ -367,11 +366,9 @@ class _Build:
             _set_units(target, manifest)
 
         # Count the units of earlier builds, which are reused.
-        done = set[ShardHeader]()
         find = partial(find_units, self._out, config)
         for units, damaged in self._execute(find, find_tasks(self._out, manifest)):
             for summary in units:
-                done.add(summary.header)
                 self._add(summary, counts, target, reused=True)
             counts.damaged += damaged
         counts.show()  # the first unit may take a minute
@@ -379,7 +376,7 @@ class _Build:
         if target is not None:
             self._meet(target, counts)
         else:
-            due = (header for header in manifest.headers() if header not in done)
+            due = [header for header in manifest.headers() if header not in self._units]
             self._run_units(due, counts, target)
         return counts
 
@@ -424,7 +421,7 @@ class _Build:
         filters, names = self._config.filters, [entry.name for entry in manifest.objects]
         if filters.outlier_sigma == 0.0 or not manifest.units:
             return {}
-        self._survey = survey(self._out, manifest, self._successes)
+        self._survey = survey(self._out, manifest, self._units)
         successes = self._survey.successes
         lost = successes["object"][successes["removal"] == Removal.OUTLIER]
         counts = np.bincount(lost, minlength=len(names))
@@ -451,11 +448,13 @@ class _Build:
         self, summary: UnitSummary, counts: Counts, target: Target | None, *, reused: bool = False
     ) -> None:
         """Count a completed unit; if `reused`, an earlier build completed it."""
-        if target is not None and summary.successes is not None:
-            name = summary.header.object_name
-            hits = [c for c, s in summary.hits if (name, c, s) not in self._rejected]
+        self._units[summary.header] = summary
+        if target is not None:
+            name, successes = summary.header.object_name, summary.successes
+            passed = successes[successes["by_filter"] == Removal.KEPT]
+            keys = zip(passed["candidate"].tolist(), passed["standoff_index"].tolist(), strict=True)
+            hits = [palm for palm, i in keys if (name, palm, i) not in self._rejected]
             target.add(summary.header, hits)
-            self._successes[summary.header] = summary.successes
         counts.add(summary, reused=reused)
 
     # Files
@@ -466,13 +465,11 @@ class _Build:
         Returns:
             Whether the files were written, and their content.
         """
-        out, known = self._out, self._successes or None
-        if is_assembled(out, verify_shards=True):
-            return False, summarise(out)
+        surveyed = self._survey or survey(self._out, self._manifest, self._units)
+        if is_assembled(self._out, surveyed.manifest, surveyed.seals):
+            return False, surveyed.assembly
         with self._progress("assemble", "shards") as report:
-            return True, assemble_locked(
-                out, self._manifest, known=known, surveyed=self._survey, progress=report
-            )
+            return True, assemble_locked(self._out, surveyed, progress=report)
 
 
 def _set_units(target: Target, manifest: Manifest) -> None:

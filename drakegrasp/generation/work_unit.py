@@ -14,16 +14,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import object_files, shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, ROBUST_FIELDS
-from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, write_shard
-from drakegrasp.dataset.successes import find_hits, shard_successes, successes_of
+from drakegrasp.dataset.shards import Shard, ShardHeader, write_shard
+from drakegrasp.dataset.successes import UnitSummary, read_summary, summary_of
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.filters import Removal
 from drakegrasp.generation.attempts import (
@@ -90,27 +87,6 @@ class WorkUnit(DatasetTask):
         return self.header.path(self.out), self.header.journal_path(self.out)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UnitSummary:
-    """Summary of a completed unit, whose data are in its shard.
-
-    Attributes:
-        header: Header of the unit.
-        outcomes: Number of attempts by outcome.
-        errors: Number of solver errors by message.
-        successes: The successes with what filters need of each, see `successes_of`; None
-            without a target.
-        hits: Candidates and stand-offs of the attempts that count for the target, see `find_hits`;
-            empty without a target.
-    """
-
-    header: ShardHeader
-    outcomes: dict[Outcome, int]
-    errors: dict[str, int]
-    successes: Table | None = None
-    hits: tuple[tuple[int, int], ...] = ()
-
-
 #: Only one unit runs at a time, because two threads in one scene would mix up their results.
 _one_unit = threading.Lock()
 
@@ -131,7 +107,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
     with _one_unit, disk_full_named(out):
         try:
             # A process may have died after writing the shard and before returning.
-            summary = _find_unit(out, header, unit.config)
+            summary = read_summary(out, header, unit.config)
         except DataError:
             summary = None
         path = header.journal_path(out)
@@ -174,16 +150,10 @@ class _UnitRun:
             trials |= self._repeats(records)
 
         with self._step("write"):
-            shard = Shard(header=header, trials=trials, looks={**looks})
-            write_shard(self._unit.out, shard)
-        rows = Table(trials)[looks["row"]]
-        rows = rows.with_columns(looks, depth_otm=looks["image_otm"][:, 3])
-        return UnitSummary(
-            header=header,
-            outcomes=count_outcomes(trials["outcome"]),
-            errors=dict(self._errors),
-            **_judged(rows, self._config),
-        )
+            shard = Shard(header=header, trials=trials, looks=looks)
+            seal = write_shard(self._unit.out, shard)
+        depth = looks["image_otm"][:, 3]
+        return summary_of(shard, seal, self._setup.sizes, depth, self._config, self._errors)
 
     @contextmanager
     def _step(self, step: str) -> Iterator[None]:
@@ -284,41 +254,7 @@ class _UnitRun:
         return judge_sample(self._setup.prepared.model, trial, rules, views=False) is Removal.KEPT
 
 
-def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
-    """Return the number of attempts by outcome, given a column of outcomes (n,)."""
-    values, counts = np.unique(outcomes, return_counts=True)
-    return {Outcome(int(v)): int(n) for v, n in zip(values, counts, strict=True)}
-
-
 # Units that are done
-
-
-def _find_unit(out: Path, header: ShardHeader, config: Config) -> UnitSummary | None:
-    """Return the summary of a completed unit, or None if it has no shard.
-
-    Raises:
-        DataError: If the shard is damaged or belongs to another unit.
-    """
-    path = header.path(out)
-    if not path.exists():
-        return None
-    with open_shard(path, header) as file:
-        outcomes = count_outcomes(file["trials/outcome"][:])
-        judged = _judged(shard_successes(file), config) if config.has_target else {}
-    return UnitSummary(header=header, outcomes=outcomes, errors={}, **judged)
-
-
-def _judged(rows: Table, config: Config) -> dict[str, Any]:
-    """Return the successes and hits of a unit for its summary; empty without a target.
-
-    Args:
-        rows: Columns of the successes, see `shard_successes`.
-        config: Configuration of the dataset.
-    """
-    if not config.has_target:
-        return {}
-    successes = successes_of(rows, config)
-    return {"successes": successes, "hits": find_hits(successes, config)}
 
 
 def find_tasks(out: Path, manifest: Manifest) -> Iterator[tuple[ShardHeader, ...]]:
@@ -348,16 +284,15 @@ def find_units(
     names = set(os.listdir(shards_folder(out, headers[0].object_name)))
     for header in headers:
         # Open only files that are listed.
+        if header.file_name not in names:
+            continue
         try:
-            found = _find_unit(out, header, config) if header.file_name in names else None
+            done.append(read_summary(out, header, config))
         except DataError:
             damaged.append(str(header.path(out).relative_to(out)))
-            found = None
-        if found is None:
             continue
 
         # A process may have died after writing the shard and before removing the journal.
         if header.journal_path(out).name in names:
             header.journal_path(out).unlink(missing_ok=True)
-        done.append(found)
     return done, damaged

@@ -21,7 +21,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from io import BufferedRandom, BufferedReader, FileIO
+from io import BufferedRandom, BufferedReader, BytesIO, FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,7 +68,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_atomic(path: Path, content: bytes) -> None:
+def write_atomic(path: Path, content: Buffer) -> None:
     """Write a file with these bytes, see `atomic_path`."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
@@ -192,45 +192,66 @@ def seal(path: Path) -> None:
         file.write(text)
 
 
+def write_sealed(path: Path, content: BytesIO) -> bytes:
+    """Seal the HDF5 file in a buffer, write it, see `atomic_path`, and return the seal."""
+    view = content.getbuffer()
+    text = _seal_text(hashlib.sha256(view[SEAL_SIZE:]).hexdigest())
+    view[:SEAL_SIZE] = text
+    write_atomic(path, view)
+    return text
+
+
 def read_seal(path: Path) -> bytes:
     """Return the seal of a file, which identifies its content; the seal is not verified.
 
     Raises:
         DataError: If the file cannot be read.
     """
-    try:
-        validate_regular(path)
-        with path.open("rb", buffering=0) as file:
-            return file.read(SEAL_SIZE)
-    except OSError as error:
-        raise DataError(f"{path}: must be a complete shard, got none ({error.strerror})") from None
+    with open_sealed(path, verify=False) as file:
+        return file.read(SEAL_SIZE)
 
 
 def validate_seal(path: Path, what: str = "shard", largest: int | None = LARGEST_SEALED) -> None:
-    """Raise an error if any bit of a sealed file has changed.
+    """Raise an error if any bit of a sealed file has changed, see `open_sealed`."""
+    open_sealed(path, what, largest).close()
+
+
+def open_sealed(
+    path: Path,
+    what: str = "shard",
+    largest: int | None = LARGEST_SEALED,
+    *,
+    verify: bool = True,
+) -> BufferedReader:
+    """Open a sealed file; the caller closes it.
 
     Args:
         path: Path of the file.
         what: What the file is, for the error message.
         largest: As for `validate_regular`.
+        verify: Whether to verify the seal, which reads the whole file.
 
     Raises:
-        DataError: If the file is damaged or missing.
+        DataError: If the file is missing, or a bit of it has changed.
     """
     try:
         validate_regular(path, largest)
-        with path.open("rb") as file:
-            stored = file.read(SEAL_SIZE)
-            intact = stored == _seal_of(file)
+        file = path.open("rb")
+        if not verify or file.read(SEAL_SIZE) == _seal_of(file):
+            file.seek(0)
+            return file
     except OSError as error:
         raise DataError(f"{path}: must be a complete {what}, got none ({error.strerror})") from None
-    if not intact:
-        raise DataError(f"{path}: must be a complete {what}, got one that is damaged or cut off")
+    file.close()
+    raise DataError(f"{path}: must be a complete {what}, got one that is damaged or cut off")
 
 
 def _seal_of(file: BufferedReader | BufferedRandom) -> bytes:
     file.seek(SEAL_SIZE)
-    digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return _seal_text(hashlib.file_digest(file, "sha256").hexdigest())
+
+
+def _seal_text(digest: str) -> bytes:
     return f"drakegrasp, sha256 of the rest: {digest}\n".encode().ljust(SEAL_SIZE, b"\0")
 
 

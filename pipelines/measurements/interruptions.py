@@ -35,6 +35,7 @@ import trimesh
 
 from drakegrasp.dataset.assemble import is_assembled
 from drakegrasp.dataset.lock import tidy
+from drakegrasp.dataset.manifest import read_manifest
 
 DATA = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
 PAGE, ROOM = 4096, 2**31
@@ -244,7 +245,8 @@ def has_one_state(out: Path) -> bool:
     for path in there:
         with h5py.File(path) as file:
             states.add((file.attrs["signature"], file.attrs["shards"]))
-    return (len(there) in (0, len(DATA)) and len(states) <= 1) or not is_assembled(out)
+    whole = len(there) in (0, len(DATA)) and len(states) <= 1
+    return whole or not is_assembled(out, read_manifest(out))
 
 
 def runs(process: psutil.Process) -> bool:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,9 +28,9 @@ from helpers.tiers import in_second_tier
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
+from drakegrasp.dataset.successes import read_summary
 from drakegrasp.errors import MachineError
 from drakegrasp.generation.pipeline import Counts
-from drakegrasp.generation.work_unit import UnitSummary
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.trial import TrialRecord
@@ -198,11 +199,12 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
 
 
 def test_few_crashes_are_no_error(sound: Path) -> None:
-    counts = Counts(read_manifest(sound), None, None, silent)
-    header = next(read_manifest(sound).headers())
+    manifest = read_manifest(sound)
+    counts = Counts(manifest, None, None, silent)
+    summary = read_summary(sound, next(manifest.headers()), manifest.config)
     for crashed, said in ((9, 0), (1, 1)):
         outcomes = {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed}
-        counts.add(UnitSummary(header=header, outcomes=outcomes, errors={}))
+        counts.add(replace(summary, outcomes=outcomes))
         assert len(counts.unexplained()) == said
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from helpers.shards import read_shard
 
 from drakegrasp.dataset import assemble as module
 from drakegrasp.dataset import hdf5, shards
-from drakegrasp.dataset.assemble import assemble, survey
+from drakegrasp.dataset.assemble import assemble, assemble_locked, survey
 from drakegrasp.dataset.manifest import read_manifest, with_postprocessing
 from drakegrasp.dataset.rejections import (
     AttemptKey,
@@ -28,7 +29,7 @@ from drakegrasp.dataset.rejections import (
     write_decisions,
 )
 from drakegrasp.dataset.schema import CAMERAS
-from drakegrasp.dataset.successes import in_image
+from drakegrasp.dataset.successes import in_image, read_summary
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import (
@@ -40,23 +41,38 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.grasp import unpack_grasp
-from drakegrasp.runtime.files import seal, validate_seal
+from drakegrasp.runtime.files import open_sealed, seal
 
 FILES = (OTO, OTM, TRIALS)
 
 
 def test_each_seal_is_verified_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though the second pass reads the shards with samples again."""
-    verified: Counter[Path] = Counter()
+    """Though the second pass opens each shard again, when all successes are known."""
+    opened, verified = Counter[Path](), Counter[Path]()
 
-    def count(path: Path, what: str = "shard") -> None:
-        verified[path] += 1
-        validate_seal(path, what)
+    def count(path: Path, what: str, *, verify: bool) -> BufferedReader:
+        opened[path] += 1
+        verified[path] += verify
+        return open_sealed(path, what, verify=verify)
 
-    monkeypatch.setattr(shards, "validate_seal", count)
+    monkeypatch.setattr(hdf5, "open_sealed", count)
     assert assemble(out).removed == {Removal.KEPT: 9}
     assert verified == Counter(out.glob("shards/*/*.h5"))
-    assert len(verified) == 6
+    assert [*opened.values()] == [2] * 6
+
+
+def test_shard_that_is_damaged_after_its_unit_ended_is_not_copied(out: Path) -> None:
+    """A build knows the units that it ran, and reads their shards to copy them only."""
+    manifest = read_manifest(out)
+    known = {h: read_summary(out, h, manifest.config) for h in manifest.headers()}
+    surveyed, before = survey(out, manifest, known), (out / TRIALS).read_bytes()
+    path = sorted(out.glob("shards/*/*.h5"))[-1]
+    content = bytearray(path.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="damaged or cut off"):
+        assemble_locked(out, surveyed)
+    assert (out / TRIALS).read_bytes() == before
 
 
 def test_assembling_again_gives_the_same_bytes(out: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 from helpers.successes import good, judge
@@ -13,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.successes import shard_successes, successes_of
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.successes import read_summary
 from drakegrasp.filters import NEEDED, Removal, is_outlier
-from drakegrasp.hand.settings import load_config
 
 
 def test_first_reason_counts() -> None:
@@ -153,7 +152,6 @@ def test_no_finger_that_is_used_may_come_near_its_cone() -> None:
 
 def test_successes_have_every_column_that_a_filter_needs(sound: Path) -> None:
     """A filter without its column would be left out without a word."""
-    (path, *_) = sorted(sound.glob("shards/*/*.h5"))
-    with h5py.File(path) as file:
-        successes = successes_of(shard_successes(file), load_config())
-    assert {*NEEDED} <= {*successes.names}
+    manifest = read_manifest(sound)
+    summary = read_summary(sound, next(manifest.headers()), manifest.config)
+    assert {*NEEDED} <= {*summary.successes.names}

@@ -233,11 +233,13 @@ def test_a_set_with_filters_of_its_own_is_merged_and_assembled_again(tmp_path: P
 def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
     write_fixed(own / "meshes", "8_wineglass_flute")
     sources, out = find_meshes(own / "meshes"), own / "out"
-    rules = [*SMALL, "candidates.max=5", "camera.size=32"]
-    half = (
-        "class Half:\n  def keep(self, successes): return successes.trial_id.argsort() % 2 == 0\n"
+    rules = [*SMALL, "candidates.max=5", "camera.size=32", "samples=99"]
+    (own / "half.py").write_text(
+        "class Half:\n"
+        "  def keep(self, successes):\n"
+        "    with open('asked', 'a') as file: file.write('.' * successes.count)\n"
+        "    return successes.trial_id.argsort() % 2 == 0\n"
     )
-    (own / "half.py").write_text(half)
     settings = [
         "candidates.method=my_sampler.py:Ring",
         "filters.own=[my_filter.py:Wide, half.py:Half]",
@@ -246,6 +248,7 @@ def test_a_dataset_of_both_is_sound_and_imports_no_code(own: Path) -> None:
     report = build(sources, out, config)
     removed = report.assembly.removed
     assert removed[Removal.OWN] == removed[Removal.KEPT] > 0
+    assert len(Path("asked").read_text()) == report.assembly.grasps  # each is judged once
     assert check_dataset(out) == []
     with h5py.File(out / "trials.hdf5") as file:
         assert set(file["trials/source"][:]) == {Source.OWN}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -94,12 +96,21 @@ def test_number_of_workers_changes_nothing(
     assert_same_dataset(small_dataset, out)
 
 
-def test_second_build_simulates_nothing(
-    small_meshes: Path, out: Path, small_config: Config
+def test_second_build_simulates_nothing_and_opens_each_shard_once(
+    small_meshes: Path, out: Path, small_config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")}
+    opened, reader = Counter[Path](), Path.open
+
+    def count(path: Path, *given: Any, **named: Any) -> Any:
+        opened[path] += 1
+        return reader(path, *given, **named)
+
+    monkeypatch.setattr(Path, "open", count)
     report = build(small_meshes, out, small_config, _nothing_runs)
     assert (report.simulated, report.reused) == (0, 12)
+    files = [*out.glob("shards/*/*.h5"), *out.glob("objects/*.h5")]
+    assert {path: n for path, n in opened.items() if path.suffix == ".h5"} == Counter(files)
     assert {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")} == before
 
 

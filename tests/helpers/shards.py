@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import read_columns
 from drakegrasp.dataset.schema import LOOK_FIELDS, Field, sizes
-from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, trial_columns
+from drakegrasp.dataset.shards import Shard, ShardHeader, open_shard, trial_columns, write_shard
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import validate_seal
 
@@ -52,13 +52,19 @@ def some_shard(*, trials: int = 12, looks: int = 3, seed: int = 0) -> Shard:
     )
 
 
+def written_shard(out: Path, shard: Shard) -> Path:
+    """Write a shard and return its path."""
+    write_shard(out, shard)
+    return shard.header.path(out)
+
+
 def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
     """Return a shard; without a header, that of any work unit."""
     if header is None:
         validate_seal(path)
         with h5py.File(path) as file:
             header = ShardHeader(**{name: file.attrs[name] for name in HEADER.stored})
-    with open_shard(path, header) as file:
+    with open_shard(path, header) as (file, _):
         return Shard(
             header=header,
             trials=read_columns(file["trials"], trial_columns()),

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.successes import judge_successes
+from drakegrasp.dataset.successes import judge_alone, judge_successes
 from drakegrasp.filters import first_removal
 from drakegrasp.table import Table
 
@@ -47,5 +47,5 @@ def judge(
     successes: Table, config: FilterConfig, rejected: Sequence[int] = ()
 ) -> npt.NDArray[np.uint8]:
     """Return why each is no sample, by the rules and by what needs all of them."""
-    by_filter = first_removal(successes, config)
-    return judge_successes(successes.with_columns(by_filter=by_filter), config, rejected)
+    successes = successes.with_columns(by_filter=first_removal(successes, config))
+    return judge_successes(judge_alone(successes, config), config, rejected)

@@ -9,11 +9,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.shards import some_shard
+from helpers.shards import some_shard, written_shard
 
 from drakegrasp.dataset.hdf5 import write_field
 from drakegrasp.dataset.schema import Field
-from drakegrasp.dataset.shards import write_shard
 from drakegrasp.runtime.environment import host_label
 from drakegrasp.runtime.files import (
     atomic_folder,
@@ -29,14 +28,14 @@ def everything_in(folder: Path) -> list[Path]:
 
 
 def test_exception_while_writing_keeps_the_file_that_was_there(tmp_path: Path) -> None:
-    path = write_shard(tmp_path, some_shard())
+    path = written_shard(tmp_path, some_shard())
     before = path.read_bytes()
     incomplete = some_shard(seed=1)
     incomplete = replace(
         incomplete, looks={k: v for k, v in incomplete.looks.items() if k != "X_CI_otm"}
     )
     with pytest.raises(KeyError, match="X_CI_otm"):
-        write_shard(tmp_path, incomplete)
+        written_shard(tmp_path, incomplete)
     assert everything_in(tmp_path) == [path]
     assert path.read_bytes() == before
 
