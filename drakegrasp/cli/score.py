@@ -129,6 +129,8 @@ def _say_card(card: Mapping[str, Any], out: Path | None, *, as_json: bool, quiet
             say(str(out / "card.md"))
     if not quiet:
         for name, each in card["sets"].items():
-            say(f"{name}: {share_text(each['measures']['headline'], 1, ' %')}", err=True)
+            shares = {m: share_text(of, 1, " %") for m, of in each["measures"].items()}
+            clean = f", clean {shares['clean']}" if "clean" in shares else ""
+            say(f"{name}: {shares['headline']}{clean}", err=True)
         for warning in card["warnings"]:
             say(f"warning: {warning}", err=True)

@@ -51,6 +51,7 @@ MEANINGS = {
     "prediction of each row; mean over objects",
     "matches": "lifted by the first wrist pose with every contact within d",
     "kept": "all rules of a sample, wherever the fingertips touch",
+    "clean": "kept, and no neighbour moves by more than 10 mm or 10 degrees",
     "lifted": "lifted by the first wrist pose, wherever the fingertips touch",
     "precision": "lifted by the fingertips alone",
     "stable": "a precision grasp that moves less than 5 mm and 5 degrees",
@@ -59,6 +60,8 @@ MEANINGS = {
     "reached": "as the headline, and the arm reaches it",
     "objects": "objects with a row that counts in the headline",
 }
+#: Measures whose intervals are in the table of all sets.
+WITH_INTERVAL = ("headline", "clean")
 
 
 def card_of(
@@ -70,6 +73,7 @@ def card_of(
     settings: Mapping[str, Any],
     known_objects: int,
     new_classes: bool,
+    among: bool,
     benchmark: Mapping[str, Any] | None,
     again: str,
 ) -> dict[str, Any]:
@@ -83,13 +87,18 @@ def card_of(
         settings: Everything that decides a verdict, with the versions.
         known_objects: Number of scored objects that are in the training split.
         new_classes: Whether no class of the scored objects is in the training split.
+        among: Whether the objects are among others.
         benchmark: Description of the frozen benchmark; None for another dataset.
         again: The command that creates the card again.
     """
     # Draw objects or classes, and describe each set; all sets share the draws.
     clusters = grouping.classes if new_classes else grouping.names
     draws, oracle = resample(clusters), config.verify.max_tries > 1
-    left_out = {*(() if oracle else ("lifted_any",)), *(() if "arm" in settings else OF_ARM)}
+    left_out = {
+        *(() if oracle else ("lifted_any",)),
+        *(() if among else ("clean",)),
+        *(() if "arm" in settings else OF_ARM),
+    }
     measures = {name: words for name, words in MEANINGS.items() if name not in left_out}
     described = {each.name: _set_of(each, grouping, draws, measures) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
@@ -211,9 +220,11 @@ def card_text(card: Mapping[str, Any]) -> str:
     measures = [*(name for name in card["measures"] if name != "objects"), "objects"]
     rows = []
     for name, each in card["sets"].items():
-        first, *others = (each["measures"][measure] for measure in measures)
-        shares = [share_text(first), *(_percent(other["value"]) for other in others)]
-        rows.append([name, *shares, str(each["predictions"])])
+        of = {measure: each["measures"][measure] for measure in measures}
+        shares = {measure: _percent(value["value"]) for measure, value in of.items()}
+        shares |= {measure: share_text(of[measure]) for measure in WITH_INTERVAL if measure in of}
+        rows.append([name, *shares.values(), str(each["predictions"])])
+
     lines += _table(["set", *measures, "predictions"], rows)
     drawn, level = card["intervals"]["drawn"], card["intervals"]["level"]
     within = (

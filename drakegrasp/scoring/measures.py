@@ -74,7 +74,7 @@ BINS = 5
 #: Number of components of the diversity, as in DexGraspBench.
 COMPONENTS = 5
 #: Measures of a row's best-ranked prediction.
-FIRST = ("headline", "matches", "kept", "lifted", "precision", "stable", "lifted_any")
+FIRST = ("headline", "matches", "kept", "clean", "lifted", "precision", "stable", "lifted_any")
 #: The same if an arm was asked.
 OF_ARM = ("reachable", "reached")
 

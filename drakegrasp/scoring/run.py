@@ -18,6 +18,7 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.scenes import SceneRows
 from drakegrasp.errors import DataError, GraspError, MachineError
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.scoring.benchmark import read_benchmark, rows_digest
@@ -138,6 +139,7 @@ def score(
         settings=settings,
         known_objects=_known_objects(grouping.names, data, train),
         new_classes=not set(grouping.classes) & _texts(train, "class_name"),
+        among=isinstance(data, SceneRows) and data.several,
         benchmark=read_benchmark(data.path.parent, config, settings["versions"]),
         again=again,
     )

@@ -144,6 +144,7 @@ class Verdict:
     Attributes:
         outcome: Name of the outcome.
         lifted, precision, stable, kept: As in a dataset, wherever the fingertips touch.
+        clean: Kept, with all neighbours left in place.
         matches: Lifted, with every contact within `verify.max_contact_error` of the requested one.
         lifted_any: Whether any of at most five wrist poses holds: an oracle chose among them.
         contact_error: Largest distance between requested and reached contacts [m], of the
@@ -163,6 +164,7 @@ class Verdict:
     precision: bool
     stable: bool
     kept: bool
+    clean: bool
     lifted_any: bool
     contact_error: float | None
     penetration: float | None
@@ -195,6 +197,7 @@ def verdict_of(result: Verification) -> Verdict:
         precision=result.precision,
         stable=result.stable,
         kept=result.kept,
+        clean=result.clean,
         lifted_any=result.lifted_any,
         contact_error=_rounded(farthest) if math.isfinite(farthest) else None,
         penetration=None if closed is None else _rounded(np.nanmax(closed.contacts.penetration)),
@@ -211,7 +214,7 @@ def protocol_verdict(found: PostureVerdict) -> Verdict:
     A protocol only decides on success, which is then used for all measures.
     """
     outcome = found.reason.partition(":")[0] or "success"
-    measures = ("matches", "lifted", "precision", "stable", "kept", "lifted_any")
+    measures = ("matches", "lifted", "precision", "stable", "kept", "clean", "lifted_any")
     return Verdict(
         outcome=outcome,
         **dict.fromkeys(measures, found.success),

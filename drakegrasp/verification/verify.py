@@ -159,6 +159,7 @@ def _of_posture(verdict: Verification) -> Verification:
     """Try a posture in each of its resting poses and preshapes; return the best verdict."""
     # Try each of them.
     grasp, tried = verdict.grasp, list[tuple[Verification, str]]()
+    views = grasp.placed.around is None  # the cameras of a build see one object
     hand, nothing = load_hand(grasp.config.hand_source), np.full(len(verdict.p_OQ), np.nan)
     for stand, (placed, given) in enumerate(zip(grasp.stands, grasp.postures, strict=True)):
         for shape in grasp.preshapes:
@@ -172,7 +173,7 @@ def _of_posture(verdict: Verification) -> Verification:
                 trial=_of_all_fingers(trial, start.unused, hand.num_fingers),
                 contact_error=nothing,
                 normal_error=nothing,
-                removal=judge_sample(placed.model, trial, grasp.config),
+                removal=judge_sample(placed.model, trial, grasp.config, views=views),
             )
             found = replace(verdict, stand=stand, tries=(one,))
             tried.append((_judged(found), shape))

@@ -115,6 +115,23 @@ def test_shares_and_their_intervals_are_printed_as_percent(
     assert result.stdout == f"net.npy: 25.0 % {said}\n"
 
 
+def test_the_share_of_clean_grasps_is_printed_beside_the_headline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If the card has it, as among other objects."""
+    some, none = {"value": 0.5, "low": 0.25, "high": 0.75}, {"value": 0.0, "low": 0.0, "high": 0.0}
+    sets = {
+        "own": {"measures": {"headline": some, "clean": none}},
+        "constant": {"measures": {"headline": none}},
+    }
+    scored = SimpleNamespace(card={"headline": {}, "sets": sets, "warnings": []})
+    monkeypatch.setattr("drakegrasp.api.scoring.score", lambda *_, **__: scored)
+    data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
+    assert run("score", "--dataset", data, "--workers", 1).stderr == (
+        "own: 50.0 % (25.0 to 75.0), clean 0.0 % (no interval)\nconstant: 0.0 % (no interval)\n"
+    )
+
+
 @pytest.mark.sim
 def test_without_a_folder_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

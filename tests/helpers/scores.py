@@ -20,12 +20,15 @@ FAILS = Verdict(
     precision=False,
     stable=False,
     kept=False,
+    clean=False,
     lifted_any=False,
     contact_error=None,
     penetration=None,
     posture=(),
     seconds=1.0,
 )
+#: What a kept grasp is besides lifted.
+KEPT = {"kept": True, "clean": True, "precision": True}
 
 
 def verdict(word: str, error: float = 0.004, confidence: float = 0.0) -> Verdict:
@@ -34,7 +37,7 @@ def verdict(word: str, error: float = 0.004, confidence: float = 0.0) -> Verdict
         return FAILS
     lifted = FAILS.__dict__ | {"outcome": "success", "lifted": True, "lifted_any": True}
     lifted |= {"matches": error <= 0.02, "contact_error": error, "penetration": 0.001}
-    return Verdict(**(lifted | ({"kept": True, "precision": True} if word == "kept" else {})))
+    return Verdict(**(lifted | (KEPT if word == "kept" else {})))
 
 
 class Rows:
@@ -79,10 +82,18 @@ def grouping(*objects: int) -> Grouping:
 
 
 class FakeVerify:
-    """Tries nothing: a grasp holds if a function of it says so. Counts what it was asked."""
+    """Tries nothing: a grasp holds if a function of it says so. Counts what it was asked.
 
-    def __init__(self, holds: Callable[[np.ndarray], bool], stop_after: int | None = None) -> None:
-        self.holds, self.asked, self.stop_after = holds, 0, stop_after
+    A grasp that holds leaves its neighbours in place if another function says so.
+    """
+
+    def __init__(
+        self,
+        holds: Callable[[np.ndarray], bool],
+        stop_after: int | None = None,
+        leaves: Callable[[np.ndarray], bool] = lambda grasp: True,
+    ) -> None:
+        self.holds, self.asked, self.stop_after, self.leaves = holds, 0, stop_after, leaves
 
     def __call__(self, grasps: Any, rows: Sequence[int], on_result: Any) -> None:
         for index, grasp in enumerate(grasps.numbers()):
@@ -98,6 +109,7 @@ class FakeVerify:
                 precision=lifted,
                 stable=lifted,
                 kept=lifted,
+                clean=lifted and self.leaves(grasp),
                 lifted_any=lifted,
                 first=None,
                 farthest_contact=0.001 if lifted else np.nan,

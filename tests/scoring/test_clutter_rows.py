@@ -9,21 +9,26 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+from helpers.scores import FakeVerify
 
 from drakegrasp.api.scoring import score
-from drakegrasp.api.verifying import verify_grasp, verify_grasps
+from drakegrasp.api.verifying import run_verification, verify_grasp, verify_grasps
 from drakegrasp.dataset.clutter import load_scene
-from drakegrasp.dataset.scenes import SceneRows, open_rows
+from drakegrasp.dataset.scenes import SceneDataset, SceneRows, open_rows
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.frames import transform_points, unpack_pose
 from drakegrasp.grasp import transform_grasp
 from drakegrasp.hand.description import load_hand
+from drakegrasp.scoring.card import share_text
 from drakegrasp.scoring.references import REFERENCES, ReferenceInput
+from drakegrasp.scoring.run import score as score_by
 from drakegrasp.simulation.attempts import make_attempts
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 
 pytestmark = pytest.mark.sim
+#: A rule that no pose of a camera passes.
+NO_CAMERA = "filters.min_camera_height=9"
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +117,39 @@ def test_a_score_counts_verdicts_in_the_scene(rows: SceneRows, path: Path) -> No
     (judged,) = scored.sets
     (verdicts,) = judged.verdicts
     assert len(verdicts) == 1
+
+
+def test_a_card_tells_how_many_kept_grasps_leave_their_neighbours(rows: SceneRows) -> None:
+    """Here only the grasp of the first row. The table has the interval, of one object none."""
+    own, names = rows.column("grasps"), rows.column("object_props/object_name")
+    tries = FakeVerify(lambda _: True, leaves=lambda grasp: (grasp == own[0]).all())
+    config, settings = dataset_config(rows), {"versions": {}}
+    about = {"config": config, "settings": settings, "per_object": None, "again": ""}
+    scored = score_by(rows, {}, tries, train=rows, references=["own"], **about)
+    found = scored.card["sets"]["own"]["measures"]
+    share = 1.0 / (np.count_nonzero(names == names[0]) * len(set(names)))
+    assert found["kept"]["value"] == 1.0 > found["clean"]["value"] == pytest.approx(share, abs=1e-6)
+    assert f"| own | 100 (no interval) | 100 | 100 | {share_text(found['clean'])} |" in scored.text
+
+
+def test_postures_are_judged_by_the_rules_of_contacts(rows: SceneRows) -> None:
+    """The filters of the cameras of a build do not count among others."""
+    data, row = SceneDataset(rows.path, points=None, split="test"), len(rows) - 1
+    grasps, config = data.tables["grasps"], dataset_config(rows, overrides=(NO_CAMERA,))
+    (i,) = np.flatnonzero(
+        (grasps["trial_id"] == rows.column("trial_id")[row])
+        & (grasps["scene"] == rows.scenes[row])
+        & (grasps["object"] == rows.places[row])
+    )
+    about = unpack_pose(grasps["X_TG"][[i]].astype(float)), grasps["q"][[i]].astype(float)
+    how = {"q_pregrasp": grasps["q_open"][[i]].astype(float), "joints": data.joints}
+    names = [rows.column("object_props/object_name")[row]]
+    hand, of_row = load_hand(config.hand_source), np.array([row])
+    posture = make_attempts(hand, names, *about, frame="table", of_row=of_row, **how)
+    for given in (posture, rows.column("grasps")[[row]]):
+        placed = place_on_rows(given, rows, [row], config=config)
+        (verdict,) = run_verification(placed, config, show=False)
+        assert verdict.kept, verdict.explain()
 
 
 def test_what_does_not_know_neighbours_is_refused(rows: SceneRows) -> None:

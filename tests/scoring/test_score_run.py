@@ -63,6 +63,7 @@ def test_predictions_stand_beside_reference_rows_on_the_same_rows(data):
     assert 0.0 < shares["predictions"] < 1.0
     assert card["above"]["predictions"]["own"]["value"] < 0.0
     assert card["warnings"][0].startswith("only 2 test objects")
+    assert "clean" not in card["measures"] | card["sets"]["own"]["measures"]  # no neighbours
 
 
 def test_an_interrupted_score_goes_on(data, tmp_path):
