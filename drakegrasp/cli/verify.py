@@ -48,8 +48,9 @@ class Target:
     Attributes:
         mesh: The object: a .obj, .stl, .ply or .glb file.
         units: Unit of length of the mesh. [default: m]
-        dataset: Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row
-            specifies the object, its pose and the camera's pose.
+        dataset: Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm, or scenes,
+            OUT/scenes.hdf5 or OUT/clutter.hdf5. Each row or view specifies the object, its pose,
+            its neighbours and the camera's pose.
         split: Rows of the dataset, and group in an HDF5 file of grasps. [default: test]
         frame: Frame of the grasps; mesh has the axes and the origin of the mesh file, and for
             postures needs --object. [default: object; with --dataset camera; for postures as the
@@ -193,7 +194,9 @@ def _say_counts(results: Sequence[Verification]) -> None:
     total = f"of {counted(len(results), 'grasp')}"
     for outcome, count in Counter(result.outcome.label for result in results).most_common():
         say(f"{count:,} {total}: {outcome}", err=True)
-    words = ("lifted", "matches", "precision", "stable", "kept", "lifted_any")
+    words = ["lifted", "matches", "precision", "stable", "kept", "lifted_any"]
+    if any(result.placed.around for result in results):
+        words.append("clean")
     counts = (f"{sum(getattr(each, word) for each in results):,} {word}" for word in words)
     say(f"verdicts: {', '.join(counts)}", err=True)
     if best := [result.lifted for result in results if result.grasp.rank == 0]:
@@ -224,6 +227,9 @@ def _by_protocol(
         verify_files_by_protocol(files, protocol, deliver, **how)
     else:
         placed, config, _ = place(path, target)
+        if any(grasp.placed.around for grasp in placed):
+            must = "--protocol must be lift for scenes of several objects"
+            raise GraspError(f"{must}, got {protocol}")
         grasps = sorted(placed, key=lambda grasp: grasp.index)
         verify_by_protocol(grasps, config, protocol, deliver, **how)
     if how["show"]:
@@ -264,6 +270,7 @@ def place(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config, Predic
     Raises:
         GraspError, MeshError, ConfigError, HandError: If a file or an option cannot be used.
     """
+    from drakegrasp.dataset.scenes import holds_scenes
     from drakegrasp.exchange.attempts import has_rows, holds_postures
 
     with wrong_input():
@@ -271,7 +278,12 @@ def place(path: Path, target: Target) -> tuple[list[PlacedGrasp], Config, Predic
         dataset = _dataset_of(path, target, postures)
         if dataset is None:
             placed, config = _of_mesh(path, target)
-        elif postures and target.split is None and not has_rows(path):
+        elif (
+            postures
+            and target.split is None
+            and not has_rows(path)
+            and not (dataset.is_file() and holds_scenes(dataset))
+        ):
             placed, config = _of_objects(path, target, dataset)
         else:
             placed, config, rows = _of_rows(path, target, dataset)
@@ -346,15 +358,16 @@ def _of_objects(path: Path, target: Target, dataset: Path) -> tuple[list[PlacedG
 def _of_rows(
     path: Path, target: Target, dataset: Path
 ) -> tuple[list[PlacedGrasp], Config, PredictedRows]:
-    """Return the grasps of a file on the objects of rows of a dataset, and the rows."""
+    """Return the grasps of a file on the objects of a dataset's rows or views, and the rows."""
     from drakegrasp.dataset.reader import PredictedRows
+    from drakegrasp.dataset.scenes import open_rows
     from drakegrasp.exchange.attempts import read_predictions
     from drakegrasp.verification.placing import dataset_config, place_on_rows
     from drakegrasp.verification.prediction import choose_rows
 
     # For grasps from outside, only the objects and cameras of the rows are needed.
     split = target.split or DEFAULT_SPLIT
-    data = dg.GraspDataset(dataset, split=split, fewer_fingers=dataset != path)
+    data = open_rows(dataset, split=split, fewer_fingers=dataset != path)
 
     # A given configuration is used as it is; that of a dataset is combined with the rows' draws.
     own = None if target.config is None else dg.load_config(target.config, target.overrides)
@@ -377,7 +390,7 @@ def _of_rows(
         overrides=overrides,
         frame=target.frame or "camera",
     )
-    return placed, config, PredictedRows.of(data.path, data.split, rows)
+    return placed, config, PredictedRows.of(data, rows)
 
 
 def _ranked(table: Rows, targets: Any) -> Rows:

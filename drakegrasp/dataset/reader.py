@@ -27,6 +27,7 @@ from drakegrasp.dataset.hdf5 import (
     ImageRows,
     open_hdf5,
     open_samples,
+    opened,
     read_columns,
     says_damage,
     write_field,
@@ -376,7 +377,7 @@ class PredictedRows:
     valid as long as the dataset has the same shards.
 
     Attributes:
-        split, camera: Split and camera of the data file.
+        split, camera: Split and camera of the data file; the camera of scenes is "view".
         shards: Hash of the shards that the dataset was assembled from, as its files have it.
         row: (n,) int64, rows of the split.
         trial_id: (n,) int64, rows of trials.hdf5.
@@ -389,15 +390,15 @@ class PredictedRows:
     trial_id: npt.NDArray[np.int64]
 
     @classmethod
-    def of(cls, path: Path, split: str, rows: npt.NDArray[np.int64]) -> PredictedRows:
-        """Return the rows of a split of a data file.
+    def of(cls, data: GraspDataset, rows: npt.NDArray[np.int64]) -> PredictedRows:
+        """Return the rows of a split of a data file, or of the views of scenes.
 
         Raises:
-            DataError: If the file is missing, damaged, or differs from the schema.
+            DataError: If the file is missing or damaged.
         """
-        with open_samples(path) as file:
-            said = {name: str(file.attrs[name]) for name in ("camera", "shards")}
-            return cls(split=split, **said, row=rows, trial_id=file[split]["trial_id"][:][rows])
+        with opened(data.path, "a data file or scenes of drakegrasp") as file:
+            shards, ids = str(file.attrs["shards"]), data.column("trial_id")[rows]
+        return cls(split=data.split, camera=data.camera, shards=shards, row=rows, trial_id=ids)
 
     def write(self, file: h5py.File) -> None:
         """Write the rows into a file of results."""

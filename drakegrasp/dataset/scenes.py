@@ -583,11 +583,19 @@ def open_rows(path: Path, *, split: str, fewer_fingers: bool = False) -> GraspDa
     Raises:
         DataError: See `GraspDataset` and `SceneDataset`.
     """
-    with opened(path, "a data file or scenes of drakegrasp") as file:
-        of_scenes = "scenes" in file
-    if of_scenes:
+    if holds_scenes(path):
         return SceneRows(path, split=split)
     return GraspDataset(path, split=split, fewer_fingers=fewer_fingers)
+
+
+def holds_scenes(path: Path) -> bool:
+    """Return whether a file of a dataset holds scenes; otherwise it is a data file.
+
+    Raises:
+        DataError: If the file is missing or damaged.
+    """
+    with opened(path, "a data file or scenes of drakegrasp") as file:
+        return "scenes" in file
 
 
 def grasps_of_trials(trials: Mapping[str, AnyArray], X_TO: Array, samples: AnyArray) -> Columns:

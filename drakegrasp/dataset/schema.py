@@ -567,6 +567,12 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     *(replace(field, of=field.name) for field in _WORDS),
     Field("kept", "bool", "whether the grasp passes the filters of a dataset, except filters "
           "that need images or other grasps", of="kept"),
+    Field("clean", "bool", "whether the grasp is kept, and no neighbour moved by more than 10 mm "
+          "or turned by more than 10 degrees", of="clean"),
+    Field("neighbour_shift", "float64", "largest motion of a neighbour's origin; NaN without "
+          "neighbours", unit="m", of="disturbance.shift"),
+    Field("neighbour_turn", "float64", "largest turn of a neighbour; NaN without neighbours",
+          unit="rad", of="disturbance.turn"),
     Field("removal", "uint8", f"first filter that removes a lifted grasp: {_labels(list(Removal))}",
           stage=Stage.TRIED, of="removal"),
     Field("lifted_any", "bool",

@@ -282,6 +282,9 @@ def _matched(path: Path, file: h5py.File, snapshot: Snapshot, names: list[str]) 
     if rows.shards != snapshot.trials.attributes.get("shards"):
         raise DataError(f"{path}: must be for {snapshot.out} as it is now, got another; {again}")
 
+    if rows.camera not in CAMERAS:
+        raise DataError(f"{path}: must be for rows of a data file, got views of scenes")
+
     # The rows must exist, and have the objects that the verdicts name.
     ids = rows.trial_id
     there = len(ids) == len(rows.row) == len(names) and bool(

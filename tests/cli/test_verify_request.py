@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +10,27 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from helpers.commands import error_line, run
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
+import drakegrasp as dg
 from drakegrasp.cli.verify import Target, place
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError, HandError
+from drakegrasp.dataset.scenes import SceneRows
+from drakegrasp.errors import DataError, GraspError, HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
+from drakegrasp.page.app import Inspection
 
 DRAWN = [
     "randomize.friction_hand=[0.7, 1.3]",
     "randomize.friction_table=[0.7, 1.3]",
     "randomize.mass=[0.5, 1.5]",
 ]
+#: What a verdict among others has besides.
+NEIGHBOURS = ("clean", "neighbour_shift", "neighbour_turn")
 
 
 @pytest.fixture(scope="module")
@@ -169,3 +176,56 @@ def test_grasps_of_others_are_tried_on_rows_that_leave_fingers_out(tmp_path: Pat
     assert len(grasps) == len(predicted) > 0
     with pytest.raises(GraspError, match="test must have contacts of all fingers, got "):
         placed(out, split="test")
+
+
+@pytest.fixture(scope="module")
+def views(small_clutter: Path) -> SceneRows:
+    """Views of scenes of several objects."""
+    return SceneRows(small_clutter / "clutter.hdf5", split="test")
+
+
+@pytest.mark.sim
+def test_grasps_of_views_have_the_verdicts_of_their_scenes(
+    views: SceneRows, tmp_path: Path
+) -> None:
+    """On both outputs; the file of results is for no page of images."""
+    rows, path, out = [len(views) - 1, 0], tmp_path / "grasps.h5", tmp_path / "run.h5"
+    with h5py.File(path, "w") as file:
+        file["grasps"], file["rows"] = views.column("grasps")[rows], rows
+    given = ("verify", path, "--dataset", views.path, "--workers", 1, "--json", "--out", out)
+    result = run(*given)
+    assert result.exit_code == 0, result.output
+    due = dg.verify_grasps(views.column("grasps")[rows], on=views, rows=rows)
+    moved = np.array([(d.shift, d.turn) for d in (verdict.disturbance for verdict in due) if d])
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    with h5py.File(out) as file:
+        columns = {name: file["grasps"][name][:].tolist() for name in NEIGHBOURS}
+        told = {name: file["rows"][name][:].tolist() for name in ("row", "trial_id")}
+        assert file["rows"].attrs["camera"] == "view"
+    assert told == {"row": rows, "trial_id": views.column("trial_id")[rows].tolist()}
+    assert [line["explain"] for line in lines] == [verdict.explain() for verdict in due]
+    for found in (columns, {name: [line[name] for line in lines] for name in NEIGHBOURS}):
+        assert found["clean"] == [verdict.clean for verdict in due]
+        pairs = np.column_stack([found["neighbour_shift"], found["neighbour_turn"]])
+        np.testing.assert_allclose(pairs, moved, rtol=1e-5)  # lines are rounded
+    count = sum(verdict.clean for verdict in due)
+    assert f", {count} clean\n" in run(*given[:-3]).stderr
+    with pytest.raises(DataError, match="must be for rows of a data file, got views of scenes"):
+        Inspection(views.path.parent, out)
+
+
+@pytest.mark.sim
+def test_postures_of_views_need_no_rows(views: SceneRows, tmp_path: Path) -> None:
+    """One for each view, or those of an object on each view of it; always among its neighbours."""
+    names = views.column("object_props/object_name").tolist()
+    q = np.zeros((len(views), len(load_hand().joint_names)))
+    np.savez(tmp_path / "each.npz", X_FG=np.tile(np.eye(4), (len(views), 1, 1)), q_grasp=q)
+    np.savez(tmp_path / "one.npz", X_FG=np.eye(4)[None], q_grasp=q[:1], object=names[:1])
+    for name, count in (("each", len(views)), ("one", names.count(names[0]))):
+        grasps, _, told = place(tmp_path / f"{name}.npz", Target(dataset=views.path))
+        assert told is not None and len(grasps) == len(told.row) == count
+        assert all(grasp.placed.around for grasp in grasps)
+    given = (tmp_path / "each.npz", "--dataset", views.path, "--protocol", "dexgraspbench")
+    assert "--protocol must be lift for scenes of several objects, got dexgraspbench" in (
+        error_line(run("verify", *given))
+    )

@@ -23,7 +23,7 @@ ENDS = (Outcome.SUCCESS, Outcome.SUCCESS, Outcome.START_COLLISION, Outcome.DROPP
 def write_predictions(out: Path, path: Path) -> Path:
     """Write the results of four predictions, for the first two rows of `train` in turns."""
     data = GraspDataset(out / "grasping_oto.hdf5", split="train")
-    rows = PredictedRows.of(data.path, "train", np.array([0, 1, 0, 1]))
+    rows = PredictedRows.of(data, np.array([0, 1, 0, 1]))
     true = Trials(out)[rows.trial_id.tolist()].columns()
     columns = {
         field.name: np.full(4, "", dtype=object)
