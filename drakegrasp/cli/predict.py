@@ -14,13 +14,14 @@ import drakegrasp as dg
 from drakegrasp.cli.arguments import AnyPath, Count, File, Positive, Settings, Split, Units
 from drakegrasp.cli.console import UsageError, say, wrong_input
 from drakegrasp.cli.reach import ArmOptions
-from drakegrasp.errors import GraspError, MeshError
+from drakegrasp.errors import GraspError, MeshError, counted
 
 if TYPE_CHECKING:
     from drakegrasp.arithmetic import Array
     from drakegrasp.hand.description import Hand
     from drakegrasp.reach.arm import Arm
     from drakegrasp.simulation.attempts import GraspTable
+    from drakegrasp.table import AnyArray
     from drakegrasp.vision.depth_image import View
 
 #: Suffixes of scenes, and of files of postures that are written.
@@ -29,7 +30,7 @@ HDF5 = (".h5", ".hdf5")
 KINDS = {
     "scenes": ("split", "workers", "arm"),
     "a cloud": ("units", "arm"),
-    "a depth image": ("camera", "mask", "camera_pose", "depth_scale", "arm"),
+    "a depth image": ("camera", "mask", "object_label", "camera_pose", "depth_scale", "arm"),
 }
 #: Number of grasps for one object that lifts try if it is not given; scenes have many views.
 SIMULATED = 5
@@ -45,6 +46,7 @@ class DepthImage:
         camera: Camera matrix of a depth image in pixels: four numbers, or a file with K or with fx,
             fy, cx and cy.
         mask: Image or .npy of the size of the depth image: 0, and one other value on the object.
+        object_label: Value of the mask on the object; other values above 0 are its neighbours.
         camera_pose: .npy file with the pose of the camera over the table, X_TC, as (4, 4).
             [default: from the plane on which the object stands]
         depth_scale: Unit of a .png depth image. [default: 0.001]
@@ -52,6 +54,7 @@ class DepthImage:
 
     camera: Annotated[str | None, Parameter(metavar="FX,FY,CX,CY|JSON")] = None
     mask: File | None = None
+    object_label: Positive | None = None
     camera_pose: File | None = None
     depth_scale: Metres | None = None
 
@@ -76,7 +79,7 @@ def predict(
     INPUT is the file scenes.hdf5 or clutter.hdf5 of a dataset, for all views of a split, in the
     rows of `drakegrasp score`; or a cloud of one object (.npy of shape (n, 3), or .ply), over a
     table that is z = 0, with +z up; or a depth image (.png of 16 bits, or .npy in metres) with a
-    camera matrix and a mask of one object.
+    camera matrix and a mask of one object, or of several objects with the label of one.
 
     Grasps are proposed and ordered by closing the hand on the points. Then the first ones are
     tried by lifts in simulation, on the object completed from what was seen, until one holds in all
@@ -114,9 +117,10 @@ def predict(
     else:
         tries = SIMULATED if simulate is None else simulate
         if kind == "a cloud":
-            found, hand = _of_object(_read_cloud(source, units or "m"), None, tries, **how)
+            seen = _Seen(cloud=_read_cloud(source, units or "m"))
         else:
-            found, hand = _of_object(*_see(source, image, show=not quiet), tries, **how)
+            seen = _see(source, image, show=not quiet)
+        found, hand = _of_object(seen, tries, **how)
     write_attempts(out, found, hand, arm_joints=() if arm is None else arm.joints)
     say(str(out))
 
@@ -200,9 +204,23 @@ def _of_scenes(
     return found, dg.load_hand(config.hand_source)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    """What a camera saw of an object.
+
+    Attributes:
+        cloud: (n, 3), points of the object in {T} [m].
+        view: The image that shows them, if there is one.
+        instances: (h, w), the mask of several objects, if it is one.
+    """
+
+    cloud: Array
+    view: View | None = None
+    instances: AnyArray | None = None
+
+
 def _of_object(
-    cloud: Array,
-    view: View | None,
+    seen: _Seen,
     simulate: int,
     *,
     overrides: tuple[str, ...],
@@ -219,9 +237,16 @@ def _of_object(
     from drakegrasp.arithmetic import multiply
     from drakegrasp.frames import invert_pose
     from drakegrasp.scoring.predicting import predict as predict_grasps
+    from drakegrasp.scoring.ranking import seen_neighbours
 
-    config = dg.load_config("fast", list(overrides))
-    found, ranking = predict_grasps(cloud, view, config, simulate=simulate, count=count, arm=arm)
+    config, view, around = dg.load_config("fast", list(overrides)), seen.view, None
+    if view is not None and seen.instances is not None and (simulate or arm is not None):
+        around = seen_neighbours(view, seen.instances, (), config)
+        if show:
+            say(f"{counted(len(around.models), 'neighbour')} completed from the view", err=True)
+    how: dict[str, Any] = {"simulate": simulate, "count": count, "arm": arm, "around": around}
+    found, ranking = predict_grasps(seen.cloud, view, config, **how)
+
     if view is not None:
         X_TC = np.asarray(view.X_TC)
         X_CG = multiply(invert_pose(X_TC), found.X_FG)
@@ -277,8 +302,8 @@ def _read_depth(path: Path, scale: float | None) -> Array:
     return depth
 
 
-def _see(path: Path, image: DepthImage, *, show: bool) -> tuple[Array, View]:
-    """Return the object's points (n, 3) in {T} [m], and the view that shows them.
+def _see(path: Path, image: DepthImage, *, show: bool) -> _Seen:
+    """Return what a depth image shows of the object and beside it.
 
     Raises:
         GraspError: If a file is invalid; the message names it.
@@ -291,7 +316,13 @@ def _see(path: Path, image: DepthImage, *, show: bool) -> tuple[Array, View]:
 
     assert image.camera is not None and image.mask is not None
     depth = _read_depth(path, image.depth_scale)
-    K, own, off = images.read_camera(image.camera, depth.shape), images.read_mask(image.mask), ""
+    K, off, instances = images.read_camera(image.camera, depth.shape), "", None
+    if image.object_label is None:
+        own = images.read_mask(image.mask)
+    else:
+        instances = images.read_labels(image.mask, image.object_label)
+        own = instances == image.object_label
+
     if image.camera_pose is not None:
         with named(image.camera_pose):
             pose = read_pose(read_numbers(image.camera_pose), "X_TC")
@@ -305,4 +336,5 @@ def _see(path: Path, image: DepthImage, *, show: bool) -> tuple[Array, View]:
         say(f"{table}; the camera is {1e3 * pose[2, 3]:.0f} mm above it", err=True)
     with named(path):
         cloud = images.cloud_from_depth(depth, K, own, pose)
-    return cloud, View(depth=depth, mask=own, K=images.read_lens(K), X_TC=pose)
+    view = View(depth=depth, mask=own, K=images.read_lens(K), X_TC=pose)
+    return _Seen(cloud=cloud, view=view, instances=instances)

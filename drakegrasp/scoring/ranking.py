@@ -14,7 +14,6 @@ aside and with less friction. Mass, friction and filters are those of the config
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -394,14 +393,19 @@ def seen_neighbours(
         config: The configuration of the lifts, with the mass of a neighbour.
 
     Raises:
+        GraspError: If a neighbour is not on the table.
         MeshError: If a neighbour cannot be simulated.
     """
     found = list[PlacedObject]()
     for value in np.unique(instances[(instances != 0) & (view.mask == 0)]).tolist():
         own = view._replace(mask=(instances == value).astype(np.uint8))
-        with suppress(TooLittleSeenError):  # then it is not known
+        try:
             solid = hull_solid(read_cloud(cloud_from_depth(own.depth, own.K, own.mask, own.X_TC)))
             found += place_completed([solid], own, config)
+        except TooLittleSeenError:
+            continue  # then it is not known
+        except GraspError as error:
+            raise GraspError(f"neighbour {value} of the mask: {error}") from None
     return Neighbourhood(
         models=tuple(each.model for each in found),
         X_TN=np.array([each.X_TO for each in found]).reshape(-1, 4, 4),

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm
-from drakegrasp.errors import GraspError, TooLittleSeenError, one_line
+from drakegrasp.errors import GraspError, TooLittleSeenError, listed, one_line
 from drakegrasp.foreign_files import read_content, read_json
 from drakegrasp.frames import as_numbers, invert_pose, make_pose, read_pose, transform_points
 from drakegrasp.mesh.distance_field import DistanceField
@@ -264,8 +264,8 @@ def _chosen(mask: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     found = values[own]
     if (found != found[:1]).any():
         raise GraspError(
-            f"{must}, got several: is it a lossy file (JPEG, WebP), or a mask of several objects? "
-            "Write the mask of one object as PNG or .npy"
+            f"{must}, got several: is it a lossy file (JPEG, WebP), or of several objects "
+            "(--object-label)? Write the mask of one as PNG or .npy"
         )
     return own
 
@@ -459,6 +459,25 @@ def read_mask(path: Path) -> npt.NDArray[np.bool_]:
     if not own.any():
         raise GraspError(f"{path}: mask is 0 everywhere")
     return own
+
+
+def read_labels(path: Path, label: int) -> npt.NDArray[np.int64]:
+    """Return the mask (h, w) of several objects in an image file or a .npy file, 0 beside all.
+
+    Args:
+        path: The file; it has another whole number above 0 on each object.
+        label: The number on one of them.
+
+    Raises:
+        GraspError: If the file is neither, has several channels, or lacks the label.
+    """
+    pixels = _pixels(path)
+    must = f"{path}: mask must be whole numbers (h, w), with {label} on the object"
+    if pixels.ndim != 2 or pixels.dtype.kind not in "iu":
+        raise GraspError(f"{must}, got {pixels.dtype} of shape {pixels.shape}")
+    if not (pixels == label).any():
+        raise GraspError(f"{must}, got {listed([str(each) for each in np.unique(pixels)])}")
+    return np.maximum(pixels.astype(np.int64), 0)
 
 
 def _pixels(path: Path) -> npt.NDArray[Any]:

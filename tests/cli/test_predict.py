@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.commands import error_line, run
-from helpers.depth_images import X_TC, K, image
+from helpers.depth_images import WIDE, X_TC, K, image
 from PIL import Image
 
 from drakegrasp.frames import invert_pose
@@ -23,6 +23,10 @@ def files(tmp_path: Path) -> Path:
     depth, mask = image()
     np.save(tmp_path / "depth.npy", depth)
     Image.fromarray(mask).save(tmp_path / "mask.png")
+    sides = np.where(mask, 1 + (np.arange(WIDE) >= 80), 0)
+    for name, values in {"labels": sides, "left": sides == 1}.items():
+        np.save(tmp_path / f"{name}.npy", values)
+    np.save(tmp_path / "sunk.npy", np.where(sides == 2, 1.5 * depth, depth))
     Image.fromarray(~mask | mask).save(tmp_path / "all.png")
     np.save(tmp_path / "one.npy", np.ones((4, 5)))
     for name, pose in {"X_TC": X_TC, "X_CT": invert_pose(X_TC)}.items():
@@ -44,6 +48,7 @@ def files(tmp_path: Path) -> Path:
 
 #: The depth image, its camera and its mask.
 SEEN = f"depth.npy --camera {K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]} --mask mask.png"
+LABELLED = SEEN.replace("mask.png", "labels.npy")
 NINE = "one.npy --camera 9,9,2,1.5"
 
 
@@ -84,6 +89,17 @@ def predict(files: Path, words: str):
         (SEEN.replace("mask.png", "bad.png"), "bad.png: must be an image, got no image file"),
         (f"{SEEN} --camera-pose one.npy", "one.npy: X_TC must be a pose"),
         (SEEN.replace("mask.png", "wide.npy"), "depth.npy: mask must be (120, 160)"),
+        ("cloud.npy --object-label 1", "--object-label must be given with a depth image only, got"),
+        (
+            f"{SEEN} --object-label 1",
+            "mask must be whole numbers (h, w), with 1 on the object, got bool",
+        ),
+        (LABELLED, "or of several objects (--object-label)? Write the mask of one as PNG or .npy"),
+        (f"{LABELLED} --object-label 3", "with 3 on the object, got 0, 1, 2"),
+        (
+            f"{LABELLED} --object-label 1 --camera-pose X_TC.npy".replace("depth", "sunk"),
+            "neighbour 2 of the mask: cloud must be points (n, 3) of one object",
+        ),
     ],
 )
 def test_bad_input_is_refused_with_one_line(files: Path, words: str, said: str) -> None:
@@ -124,6 +140,25 @@ def test_lifts_change_the_chances_and_what_to_expect_is_printed(files: Path) -> 
     assert "1 tried on the object completed from the cloud" in told[1]
     assert "1 tried on the object completed from the view" in told[2]
     assert "chance" not in predict(files, "cloud.npy --simulate 0 --quiet").stderr
+
+
+@pytest.mark.sim
+def test_neighbours_in_the_mask_are_in_the_way_of_lifts(files: Path) -> None:
+    """The left half of the box: alone, and with the other half beside it."""
+    found = dict[tuple[str, int], tuple[np.ndarray, str]]()
+    for name, mask in {"left": "left.npy", "labels": "labels.npy --object-label 1"}.items():
+        for lifts in (0, 1):
+            seen = f"{SEEN.replace('mask.png', mask)} --camera-pose X_TC.npy --simulate {lifts}"
+            result = predict(files, f"{seen} --set objects.mass=0.3")
+            assert result.exit_code == 0, result.output
+            with h5py.File(files / "out.h5") as file:
+                found[name, lifts] = file["confidence"][:], result.stderr
+    np.testing.assert_array_equal(found["labels", 0][0], found["left", 0][0])
+    assert found["labels", 1][0].max() < found["left", 1][0].max() - 0.005
+    told = {
+        key for key, (_, words) in found.items() if "1 neighbour completed from the view" in words
+    }
+    assert told == {("labels", 1)}
 
 
 def test_a_pose_that_is_given_is_checked_with_the_image(files: Path) -> None:
