@@ -45,7 +45,6 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.split import Home
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
-from drakegrasp.hand.file_format import hand_file, read_hand_file
 from drakegrasp.hand.folder import HAND_FOLDER, carried_hand, hand_digest
 from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.files import probe_folder, write_atomic
@@ -247,12 +246,6 @@ class Manifest:
         content = _content(replace(self, objects=unlicensed, refused=()))
         del content["config"]["verify"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def finger_names(config: Config) -> dict[str, bool]:
-    """Return the names of the fingers in grasp order, each with whether a grasp needs its tip."""
-    fingers = read_hand_file(hand_file(config.hand_source)).fingers
-    return {finger.name: finger.required for finger in fingers}
 
 
 def installed_versions(config: Config) -> dict[str, str]:

@@ -22,14 +22,13 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
     claim_directory,
-    finger_names,
     package_versions,
     release_directory,
 )
 from drakegrasp.dataset.paths import MANIFEST_FILE, places, reach_path
 from drakegrasp.dataset.successes import own_filters
 from drakegrasp.errors import ConfigError, DataError, counted, listed
-from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.folder import carry_hand, hand_places, moved_hand
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.simulation.attempts import GraspTable
@@ -131,6 +130,7 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
         _validate_reach(config, out)
 
         # The directory can be used: from here on, its files are changed.
+        hand = load_hand(config.hand_source)
         config = carry_hand(out, config, known.config.hand if known else None)
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
         if swept := [str(path.relative_to(out)) for path in sweep_temporary(out)]:
@@ -139,7 +139,7 @@ def open_directory(out: Path, config: Config, names: Collection[str]) -> Iterato
         try:
             yield BuildDirectory(
                 out=out,
-                manifest=_manifest(config, known),
+                manifest=_manifest(config, known, hand),
                 is_new=known is None,
                 notices=tuple(notices),
             )
@@ -157,14 +157,13 @@ def _validate_reach(config: Config, out: Path) -> None:
         )
 
 
-def _manifest(config: Config, known: Manifest | None) -> Manifest:
+def _manifest(config: Config, known: Manifest | None, hand: Hand) -> Manifest:
     """Return the manifest with which a build begins; its hand is that of the directory."""
     source = config.hand_source
     assert isinstance(source, CarriedHand)
     versions = package_versions() if known is None else known.versions
-    hand = load_hand(source)
     return replace(
-        known or Manifest(config=config, versions=versions, fingers=finger_names(config)),
+        known or Manifest(config=config, versions=versions, fingers=hand.finger_names),
         config=config,
         joints=hand.joint_order,
         versions={**versions, "hand": source.digest},

@@ -282,10 +282,7 @@ def find_units(
     """
     done, damaged = list[UnitSummary](), list[str]()
     names = set(os.listdir(shards_folder(out, headers[0].object_name)))
-    for header in headers:
-        # Open only files that are listed.
-        if header.file_name not in names:
-            continue
+    for header in [each for each in headers if each.file_name in names]:
         try:
             done.append(read_summary(out, header, config))
         except DataError:

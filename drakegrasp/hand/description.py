@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,10 +35,8 @@ from drakegrasp.hand.file_format import (
     Finger,
     HandFile,
     Spread,
-    hand_file,
-    read_hand_file,
 )
-from drakegrasp.hand.folder import hand_folder
+from drakegrasp.hand.folder import HandFolder, hand_folder
 from drakegrasp.hand.parsing import (
     KEPT_HANDS,
     Chain,
@@ -50,7 +47,6 @@ from drakegrasp.hand.parsing import (
     joint_slides,
     make_chains,
     moving_joint,
-    position_order,
     validate_own_joints,
 )
 from drakegrasp.hand.shapes import pad_surfaces
@@ -81,6 +77,10 @@ class Hand:
     spreads_deg: tuple[float, ...]  # usual spread angles
     payload: float | None  # largest mass that the hand is made for [kg]
     rated_load: float | None  # largest fingertip force that the manufacturer allows [N]
+    #: Names of the model's j joints in the order of its positions, as in every `q`. This is the
+    #: order of the tree of links whose root is the palm. It can differ from the order of the file:
+    #: in this tree a wrist of the model is below the palm.
+    joint_order: tuple[str, ...]
     joint_names: tuple[str, ...]  # the n joints that turn or slide
     joint_slides: npt.NDArray[np.bool_]  # (n,), whether each joint slides
     joint_gain: Array  # (n, 1 + k), positions per coordinate; at most one non-zero in each row
@@ -96,11 +96,6 @@ class Hand:
     def num_fingers(self) -> int:
         """Number of fingers, k."""
         return len(self.fingers)
-
-    @property
-    def joint_order(self) -> tuple[str, ...]:
-        """Names of the model's j joints in the plant's order, as in every `q`."""
-        return position_order(self.model, self.palm_link)
 
     def palm_in(self, link: str) -> Array:
         """Return the pose X_AG (4, 4) of the palm frame in a frame A of the hand.
@@ -201,6 +196,11 @@ class Hand:
         return {name: "m" if slides else "rad" for name, slides in pairs}
 
     @property
+    def finger_names(self) -> dict[str, bool]:
+        """Names of the fingers in grasp order, each with whether a grasp needs its fingertip."""
+        return {finger.name: finger.required for finger in self.fingers}
+
+    @property
     def required(self) -> npt.NDArray[np.bool_]:
         """(k,), whether a grasp needs each fingertip on the object."""
         return np.array([finger.required for finger in self.fingers])
@@ -219,20 +219,20 @@ def load_hand(source: HandSource = "barrett") -> Hand:
             lacks a link or joint that the YAML file names, or the files of a dataset's hand have
             changed.
     """
-    path, folder = hand_file(source), hand_folder(source)
+    folder = hand_folder(source)
     if isinstance(source, CarriedHand) and folder.digest != source.digest:
         raise HandError(
-            f"{path.parent}: must hold the hand of the dataset ({source.digest}), got other files "
+            f"{folder.root}: must hold the hand of the dataset ({source.digest}), got other files "
             f"({folder.digest})"
         )
-    return _load(path.absolute(), folder.stamp)
+    return _load(folder)
 
 
 @lru_cache(maxsize=KEPT_HANDS)
-def _load(path: Path, stamp: tuple[int, ...]) -> Hand:
-    """Return the hand of a hand file; parsing takes 40 ms."""
-    described = read_hand_file(path)
-    model = ModelFile(path.parent.resolve() / described.model, stamp)
+def _load(folder: HandFolder) -> Hand:
+    """Return the hand of a folder; parsing takes 40 ms."""
+    described, path = folder.described, folder.root / folder.name
+    model = ModelFile(folder.root.resolve() / described.model, folder.stamp)
     name, shaped = path.stem.removesuffix("_hand"), list[Hand]()
     try:
         hand = _build_hand(name, described, model)
@@ -266,8 +266,7 @@ def load_plain_hand(source: HandSource, where: str) -> Hand:
 
 
 def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
-    # Parse the model without shapes. Do not finalize the plant: that would add a joint for the
-    # palm.
+    # Parse the model without shapes.
     plant = MultibodyPlant(0.0)
     instance = add_model(plant, model)
     palm = described.palm
@@ -312,6 +311,9 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         chains.append(chain)
     validate_own_joints(described, chains)
 
+    # Without the weld, the plant would have a joint for the palm.
+    plant.WeldFrames(plant.world_frame(), base.body_frame())
+    plant.Finalize()
     return Hand(
         name=name,
         model=model,
@@ -327,6 +329,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         spreads_deg=described.spreads_deg,
         payload=described.payload,
         rated_load=described.rated_load,
+        joint_order=tuple(plant.GetPositionNames(instance, False, False)),
         joint_names=tuple(moving),
         joint_slides=np.array([joint_slides(joint) for joint in moving.values()], dtype=np.bool_),
         joint_gain=np.array([drives[joint][0] for joint in moving]),

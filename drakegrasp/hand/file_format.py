@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from math import sqrt
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,6 @@ from pydantic import (
 from drakegrasp import registry
 from drakegrasp.config import CarriedHand, HandSource, Standoffs, describe_mistake
 from drakegrasp.errors import HandError, one_line
-from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array
 from drakegrasp.yaml_text import parse_yaml_once
 
@@ -417,25 +416,20 @@ def validate_inside(path: Path, folder: Path) -> None:
         raise HandError(f"{path}: must be a file in {folder}, got a link or no file")
 
 
-def hand_keys(path: Path) -> Any:
-    """Return what the YAML of a hand file holds, whether its keys are valid or not.
-
-    Raises:
-        HandError: If the file cannot be read, or is not YAML.
-    """
-    try:
-        return parse_yaml_once(read_text(path))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
-
-
-def read_hand_file(path: Path) -> HandFile:
+def parse_hand_file(path: Path, text: bytes) -> HandFile:
     """Return the contents of a hand file.
+
+    Args:
+        path: Path of the file, for messages.
+        text: Its content.
 
     Raises:
         HandError: If a key or a value is invalid; the message has one line.
     """
-    tree = hand_keys(path)
+    try:
+        tree = parse_yaml_once(text)
+    except yaml.YAMLError as error:
+        raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
 
     # Another version may have other keys, so report only the version as the mistake.
     version = tree.get("version", VERSION) if isinstance(tree, dict) else VERSION

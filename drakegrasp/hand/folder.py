@@ -18,13 +18,14 @@ import re
 import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path, PurePath
+from typing import Any
 from xml.sax.saxutils import unescape
 
 from drakegrasp.config import CarriedHand, Config, HandSource
 from drakegrasp.errors import DataError, HandError
-from drakegrasp.hand.file_format import hand_file, hand_keys, validate_inside
+from drakegrasp.hand.file_format import HandFile, hand_file, parse_hand_file, validate_inside
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 
 #: Maximum total size [byte], YAML size [byte] and number of a hand's files; a stranger may have
@@ -67,7 +68,8 @@ def hand_folder(source: HandSource) -> HandFolder:
     """Return the files of a hand; they are read again if one of them has changed.
 
     Raises:
-        HandError: If there is no such hand, its files are too large, or it names a file outside its
+        HandError: If there is no such hand, a key or value of the hand file is invalid, a file
+            cannot be read, the files are too large, or one of them names a file outside of the
             folder.
     """
     place = hand_file(source).absolute(), isinstance(source, CarriedHand)
@@ -82,21 +84,12 @@ def hand_folder(source: HandSource) -> HandFolder:
 def _read_folder(path: Path, is_carried: bool) -> HandFolder:
     """Return the files of the hand of a hand file."""
     found = HandFolder(root=path.parent, name=path.name, is_carried=is_carried)
-    found.add(path.name)
-    model = found.place_of(_model_of(path), "")
+    found.described = parse_hand_file(path, found.add(path.name))
+    model = found.place_of(found.described.model, "")
     found.add(model)
     found.add_licences(path.stem.removesuffix("_hand"), model)
     found.stamp = file_stamp(found.asked)
     return found
-
-
-def _model_of(path: Path) -> str:
-    """Return the model that a hand file names; empty if the file is not a YAML mapping."""
-    try:
-        tree = hand_keys(path)
-    except HandError:
-        return ""
-    return str(tree.get("model", "")) if isinstance(tree, dict) else ""
 
 
 def file_stamp(files: Collection[Path]) -> tuple[int, ...]:
@@ -105,8 +98,8 @@ def file_stamp(files: Collection[Path]) -> tuple[int, ...]:
     return tuple(number for s in stats for number in (s.st_size, s.st_mtime_ns))
 
 
-# Not frozen: a cached hash and files that are collected one by one.
-@dataclass(kw_only=True)
+# Not frozen: its files are collected, and hashed, one by one.
+@dataclass(kw_only=True, eq=False)
 class HandFolder:
     """The files of a hand. A place is a path in its folder.
 
@@ -120,6 +113,8 @@ class HandFolder:
         asked: Paths of the named files, whether they exist or not.
         stamp: Sizes and times of these files.
         size: Total size of the files [byte].
+        described: Contents of the hand file.
+        sha256: Hash of all files but licences, independent of the folder.
     """
 
     root: Path
@@ -130,19 +125,17 @@ class HandFolder:
     asked: dict[Path, bool] = field(default_factory=dict)
     stamp: tuple[int, ...] = ()
     size: int = 0
+    described: HandFile = field(init=False)
+    sha256: Any = field(default_factory=hashlib.sha256)
 
     def content(self, place: str) -> bytes:
         """Return the bytes of a file; empty if it does not exist."""
         return self.files[place].read_bytes() if place in self.files else b""
 
-    @cached_property
+    @property
     def digest(self) -> str:
-        """A hash (16 hex digits) of all files but licences, independent of the folder."""
-        digest = hashlib.sha256()
-        for place in self.files:
-            if place not in self.licences:
-                digest.update(self.content(place))
-        return digest.hexdigest()[:16]
+        """The first 16 hexadecimal digits of the hash."""
+        return str(self.sha256.hexdigest()[:16])
 
     def place_of(self, reference: str, base: str) -> str:
         """Return the place of a file that a file in the folder `base` names.
@@ -189,14 +182,27 @@ class HandFolder:
             )
         return True
 
-    def add(self, place: str) -> None:
-        """Add a file and the files that it names, unless it is missing or already added."""
+    def add(self, place: str) -> bytes:
+        """Add a file and the files that it names, unless it is missing or already added.
+
+        Returns:
+            The content of the file; empty if it is not added.
+
+        Raises:
+            HandError: If a file cannot be read, or as `has` and `place_of`.
+        """
         path = self.root / place
         if place in self.files or not self.has(path):
-            return
+            return b""
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise HandError(f"{path}: must be readable, got: {error.strerror}") from None
         self.files[place] = path
-        for reference in _references(path):
+        self.sha256.update(content)
+        for reference in _references(path, content):
             self.add(self.place_of(reference, posixpath.dirname(place)))
+        return content
 
     def add_licences(self, hand: str, model: str) -> None:
         """Add the licences beside the hand file and the model."""
@@ -212,10 +218,10 @@ class HandFolder:
                     self.licences.append(place)
 
 
-def _references(path: Path) -> Iterator[str]:
+def _references(path: Path, content: bytes) -> Iterator[str]:
     """Yield each file that a model, a mesh or a material names."""
     pattern = _NAMED.get(path.suffix.lower())
-    for match in pattern.finditer(path.read_bytes()) if pattern else ():
+    for match in pattern.finditer(content) if pattern else ():
         reference = match[match.lastindex or 0].decode(errors="surrogateescape")
         yield unescape(reference) if pattern is REFERENCES else reference
 

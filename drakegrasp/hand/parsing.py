@@ -20,7 +20,6 @@ import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -110,27 +109,6 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     for constraint in set(plant.GetConstraintIds()) - constraints:
         plant.RemoveConstraint(constraint)
     return instance
-
-
-@lru_cache(maxsize=KEPT_HANDS)
-def position_order(model: ModelFile, palm_link: str) -> tuple[str, ...]:
-    """Return the names of a model's joints in the order of its positions, as in every `q`.
-
-    This is the order of the tree of links whose root is the palm. It can differ from the order of
-    the file: in this tree a wrist of the model is below the palm.
-
-    Args:
-        model: The file.
-        palm_link: The root link.
-
-    Raises:
-        HandError: As `add_model`.
-    """
-    plant = MultibodyPlant(0.0)
-    instance = add_model(plant, model)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(palm_link, instance))
-    plant.Finalize()
-    return tuple(plant.GetPositionNames(instance, False, False))
 
 
 #: Default moments and products of inertia of URDF and SDFormat.

@@ -21,7 +21,8 @@ from drakegrasp.config import (
     read_settings,
 )
 from drakegrasp.errors import ConfigError
-from drakegrasp.hand.file_format import hand_file, hand_names, read_hand_file
+from drakegrasp.hand.file_format import hand_names
+from drakegrasp.hand.folder import hand_folder
 from drakegrasp.registry import read_class
 
 #: Keys of `candidates` that are taken from the hand's file if they are missing or null.
@@ -155,7 +156,7 @@ def _completed(
     if missing:
         # `parse_config` rejects a hand that is not a string.
         source = source or (hand if isinstance(hand, str) else DEFAULT_HAND)
-        described = read_hand_file(hand_file(source))
+        described = hand_folder(source).described
         filled = {key: getattr(described, key) for key in missing}
         tree = {**tree, "candidates": {**candidates, **filled}}
     return parse_config(tree).with_code({**(known or {}), **code})

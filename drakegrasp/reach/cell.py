@@ -34,7 +34,7 @@ from drakegrasp.errors import ConfigError, first_line
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import even_points
-from drakegrasp.hand.parsing import Chain, add_model, find_joints, make_chains, position_order
+from drakegrasp.hand.parsing import Chain, add_model, find_joints, make_chains
 from drakegrasp.hand.shapes import hull_triangles, shape_corners
 from drakegrasp.reach.arm import TABLE_SIZE, Arm
 from drakegrasp.runtime.environment import allow_network
@@ -172,7 +172,6 @@ def _cell(arm: Arm, source: HandSource, mount: bytes) -> Cell:
         edge_step_size=0.1,
         implicit_context_parallelism=Parallelism(1),
     )
-    names = position_order(hand.model, hand.palm_link)
     cell = Cell(
         arm=arm,
         hand=hand,
@@ -181,8 +180,8 @@ def _cell(arm: Arm, source: HandSource, mount: bytes) -> Cell:
         limits=_limits(plant, instance, chain.joints),
         checker=checker,
         arm_columns=_columns(plant, instance, chain.joints),
-        hand_joints=names,
-        hand_columns=_columns(plant, hand_instance, names),
+        hand_joints=hand.joint_order,
+        hand_columns=_columns(plant, hand_instance, hand.joint_order),
         points=_points(checker),
     )
     _leave_out_overlaps(cell)

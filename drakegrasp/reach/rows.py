@@ -33,7 +33,6 @@ from drakegrasp.foreign_files import validate_no_link
 from drakegrasp.frames import Array, pack_pose, unpack_pose
 from drakegrasp.generation.scenes import OPEN_FOLLOWS_FROM, open_hands
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.parsing import position_order
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.reach.arm import Arm, mount_of
 from drakegrasp.reach.cell import Cell, make_cell
@@ -221,7 +220,7 @@ def sample_tasks(out: Path, manifest: Manifest, trials: Trials, arm: Arm) -> Ite
                 out=out,
                 name=entry.name,
                 config=manifest.config,
-                joints=manifest.joints or position_order(hand.model, hand.palm_link),
+                joints=manifest.joints or hand.joint_order,
                 arm=arm,
                 trials=own.columns(_FOLLOW_FROM),
                 trial_ids=own.trial_ids,

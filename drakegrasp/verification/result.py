@@ -21,7 +21,7 @@ from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.json_files import strict_json
-from drakegrasp.dataset.manifest import finger_names, installed_versions, origin_attributes
+from drakegrasp.dataset.manifest import installed_versions, origin_attributes
 from drakegrasp.dataset.reader import PredictedRows
 from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.filters import Removal
@@ -564,9 +564,8 @@ def write_results(
     hand = load_hand(config.hand_source)
     shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
     with atomic_hdf5(path) as file:
-        versions, fingers = installed_versions(config), finger_names(config)
-        joints = hand.joint_order
-        origin = origin_attributes(config, versions, fingers, joints)
+        versions, joints = installed_versions(config), hand.joint_order
+        origin = origin_attributes(config, versions, hand.finger_names, joints)
         file.attrs.update(origin)
         group = file.create_group(GROUP)
         for field in VERIFICATION_FIELDS:
