@@ -41,7 +41,7 @@ if TYPE_CHECKING:
         MeshError,
     )
     from drakegrasp.generation.pipeline import BuildReport
-    from drakegrasp.generation.replay import Replay, replay_trial
+    from drakegrasp.generation.replay import Replay, replay_clutter, replay_trial
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
@@ -108,6 +108,7 @@ _HOMES = {
     "propose": "scoring.predicting",
     "rank": "scoring.ranking",
     "reach_dataset": "reach.rows",
+    "replay_clutter": "generation.replay",
     "replay_trial": "generation.replay",
     "run_trial": "simulation.placement",
     "score": "api.scoring",
@@ -165,6 +166,7 @@ __all__ = [
     "propose",
     "rank",
     "reach_dataset",
+    "replay_clutter",
     "replay_trial",
     "run_trial",
     "score",

@@ -191,13 +191,13 @@ def replay(
         clutter: Row of a grasp in clutter.hdf5 that was tried; its labels are compared.
         html: Write a recording of the trial that plays in a browser.
     """
-    from drakegrasp.generation.replay import record_clutter, record_trial, replay_clutter
+    from drakegrasp.generation.replay import record_clutter, record_trial
 
     # All differences are printed: values first, then versions, which may explain them.
     if trial is not None and clutter is None:
         again, record = dg.replay_trial(out, trial), partial(record_trial, out, trial)
     elif clutter is not None and trial is None:
-        again, record = replay_clutter(out, clutter), partial(record_clutter, out, clutter)
+        again, record = dg.replay_clutter(out, clutter), partial(record_clutter, out, clutter)
     else:
         raise UsageError("either --trial or --clutter must be given")
     was, now = again.recorded.label, again.found.label

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from helpers.commands import error_line, run
 
+import drakegrasp as dg
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.paths import CLUTTER_FOLDER, clutter_path
 from drakegrasp.dataset.schema import HITS_NOTHING, NOT_TRIED
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
-from drakegrasp.generation.replay import replay_clutter
 from drakegrasp.objects.surroundings import load_surroundings, surroundings_of
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import processes
@@ -136,7 +136,7 @@ def test_every_try_is_replayed_to_the_bit(small_clutter: Path) -> None:
     tried = np.flatnonzero(outcomes != NOT_TRIED)
     assert among[tried].any() and len(set(outcomes[tried].tolist())) > 1
     for row in tried.tolist():
-        again = replay_clutter(small_clutter, row)
+        again = dg.replay_clutter(small_clutter, row)
         assert again.same, again.differences
         assert again.found == outcomes[row]
 
