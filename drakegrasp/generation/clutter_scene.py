@@ -183,6 +183,8 @@ class _Scene:
         task, n = self._task, len(self._objects)
         physics = self._config.physics
         materials = [vars(usual_materials(model, physics)) for model in self._models]
+
+        # What each of the n objects has.
         values: dict[str, Any] = {
             "object": self._objects,
             "resting": [
@@ -192,12 +194,15 @@ class _Scene:
             "X_TO": pack_pose(self._X_TN),
             **{name: [each[name] for each in materials] for name in materials[0]},
         }
+
+        # Rows of all scenes have the same length.
         row: Columns = {"split": np.array([task.split])}
         for name, value in values.items():
             column = np.asarray(value)
             empty = {"object": NO_OBJECT, "resting": _NONE}.get(name, np.nan)
             row[name] = np.full((1, task.most, *column.shape[1:]), empty, dtype=column.dtype)
             row[name][0, :n] = column
+
         row["surroundings"] = np.array([task.surroundings.name], dtype=object)
         row["seed"] = np.array([task.stream().key], dtype=np.uint64)
         return row
@@ -212,17 +217,21 @@ class _Scene:
         bare = Neighbourhood(models=around.models, X_TN=around.X_TN)
         alone = build_renderer(self._models[0], config.camera, bare) if around.boxes else renderer
         look = usual_appearance(self._models[0].name)
+
         images: dict[str, list[bytes]] = {name: [] for name in IMAGES}
         rows, visible = list[dict[str, Any]](), list[Columns]()
         count = len(self.grasps["scene"])
         for number, X_TC in enumerate(fixed_viewpoints()):
             seen = render(renderer, self._X_TN[0], X_TC, lens, self._X_TN[1:])
             depth = picture(seen, images)
+
+            # How much of each object nothing hides.
             outlines = outline_sizes(alone, self._X_TN, X_TC, lens)
             share = np.full(task.most, np.nan)
             pixels = np.array([(seen.mask == i + 1).sum() for i in range(len(outlines))])
             # An object in front of another one may cover a pixel more than its outline has.
             share[: len(outlines)] = np.minimum(pixels / np.where(outlines, outlines, np.nan), 1.0)
+
             rows.append(
                 {
                     "scene": 0,
@@ -235,6 +244,8 @@ class _Scene:
                     "visible_share": share,
                 }
             )
+
+            # Which contacts of the grasps it shows.
             sees = np.zeros((count, self.grasps["p_TQ"].shape[1]), dtype=bool)
             for i in range(len(outlines)):
                 own = self.grasps["object"] == i
@@ -244,6 +255,7 @@ class _Scene:
                 sees[own] = visible_contacts(p_TQ, nhat_Q_T, *about)
             numbers = {"view": np.full(count, number), "grasp": np.arange(count)}
             visible.append({**numbers, "visible": sees})
+
         columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
         return (
             columns,

@@ -291,9 +291,12 @@ class Clutter(Scenes):
         for k in range(len(self._numbers(i))):
             own = known[grasps["object"][known] == k]
             hits = [self._named(i, hit) for hit in grasps["hit"][own] if hit != HITS_NOTHING]
+
+            # The least and the largest share that a view shows.
             shares = self.data.tables["views"]["visible_share"][self.views(i), k]
             shares = np.sort(shares[np.isfinite(shares)])
             seen = dict.fromkeys(f"{share:.0%}" for share in shares)
+
             objects.append(
                 {
                     "name": self._named(i, k),
@@ -304,6 +307,7 @@ class Clutter(Scenes):
                     "hits": Counter(hits).most_common(),
                 }
             )
+
         return {
             **super().row(i, hand),
             "objects": objects,
@@ -332,6 +336,8 @@ class Clutter(Scenes):
         """Return what happened to a grasp of a scene, in words."""
         grasp = {name: values[row] for name, values in self.data.tables["grasps"].items()}
         kind, text, moved = self._holds(row), "", ""
+
+        # How it ended, or why it was not tried.
         words = [("free, not tried" if kind is FREE else "not free", "")]
         if kind is HITS:
             text = f"the hand meets {self._named(i, grasp['hit'])}"
@@ -340,9 +346,11 @@ class Clutter(Scenes):
             words = [(outcome.label.replace("_", " "), "lifted" if grasp["lifted"] else "failed")]
             words += [(name, "lifted") for name in ("kept", "clean") if grasp[name]]
             text = outcome.text
+
         if np.isfinite(grasp["neighbour_shift"]):
             name, shift = self._named(i, grasp["neighbour"]), 1e3 * grasp["neighbour_shift"]
             moved = f"{name} by {shift:.1f} mm, {np.degrees(grasp['neighbour_turn']):.1f}°"
+
         return {
             "row": row,
             "trial": int(grasp["trial_id"]),
