@@ -187,12 +187,15 @@ def predict_scenes(
     views = list(data.views.tolist() if rows is None else rows.views.tolist())
     places = [0] * len(views) if rows is None else rows.places.tolist()
     config = override_config(read_manifest(data.path.parent).config, overrides)
+
+    # The grasps of each view, in the order of the rows.
     work = partial(_predict_view, config, simulate, count, arm)
     tables = list[GraspTable]()
     for row, table in enumerate(in_order(execute)(work, _views(data, views, places))):
         if table is not None:
             tables.append(replace(table, of_row=np.full(len(table), row)))
         report(row + 1, len(views))
+
     if not tables:
         raise GraspError(
             f"{path}: must have views with a sample in {split} that show their object, got "
