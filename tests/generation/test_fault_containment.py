@@ -167,32 +167,34 @@ def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     assert not read_manifest(out).refused
 
 
-@pytest.mark.parametrize("step", ["build", "screen", "measure", "write"])
+STEPS = ("build", "screen", "measure", "write")
+
+
+@pytest.fixture
+def unit(undisturbed: Path, tmp_path: Path) -> WorkUnit:
+    """A unit that is not there, in a process that can be restarted."""
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    header = next(read_manifest(out).headers())
+    header.path(out).unlink()
+    return WorkUnit(out=out, header=header, config=read_manifest(out).config, restartable=True)
+
+
+@pytest.mark.parametrize("step", STEPS)
 def test_every_step_of_a_unit_is_in_its_journal(
-    undisturbed: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+    unit: WorkUnit, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So that a hang in it meets its limit, and the user is told of which step it was."""
-    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
-    header = next(read_manifest(out).headers())
-    header.path(out).unlink()
-    verdict = {step: Verdict.HUNG}.get
-    monkeypatch.setattr(Journal, "verdict", lambda _, name: verdict(name))
-    config = read_manifest(out).config
+    monkeypatch.setattr(Journal, "verdict", lambda _, name: {step: Verdict.HUNG}.get(name))
     with pytest.raises(MachineError, match=r"1_box_a: .*passed its time limit"):
-        run_unit(WorkUnit(out=out, header=header, config=config, restartable=True))
+        run_unit(unit)
 
 
-def test_every_step_of_a_unit_has_a_limit(
-    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
-    header = next(read_manifest(out).headers())
-    header.path(out).unlink()
-    step, config = Mock(wraps=Journal.step), read_manifest(out).config
+def test_every_step_of_a_unit_has_a_limit(unit: WorkUnit, monkeypatch: pytest.MonkeyPatch) -> None:
+    step = Mock(wraps=Journal.step)
     monkeypatch.setattr(Journal, "step", lambda *given: step(*given))
-    run_unit(WorkUnit(out=out, header=header, config=config, restartable=True))
+    run_unit(unit)
     limits = {name: seconds for _, name, seconds in (call.args for call in step.call_args_list)}
-    assert {"build", "screen", "measure", "write"} < limits.keys()
+    assert limits.keys() > set(STEPS)
     assert 0.0 < min(limits.values()) <= max(limits.values()) == STAGE_SECONDS
 
 

@@ -82,11 +82,6 @@ def test_a_hand_counts_by_its_files_and_not_by_their_folder(
     assert check_dataset(tmp_path / "into") == []
 
 
-def test_the_same_again_is_taken_once(sound: Path, out: Path, tmp_path: Path) -> None:
-    merge(tmp_path / "once", [sound, out])
-    assert_same_arrays(tmp_path / "once" / TRIALS, sound / TRIALS)
-
-
 def test_rejections_stay_and_are_inspected(sound: Path, out: Path, tmp_path: Path) -> None:
     key = AttemptKey(NAMES[0], 0, 0)
     assemble(out, rejected=[key])

@@ -87,7 +87,7 @@ def test_it_takes_turns_with_others_and_comes_to_workers(own: Path, box: ObjectM
     assert override_config(received, ["seed=3"]).code == config.code
 
 
-def test_a_changed_file_is_another_dataset_wherever_it_lies(own: Path) -> None:
+def test_a_file_is_the_same_wherever_it_lies(own: Path) -> None:
     setting = "candidates.method=my_sampler.py:Ring"
     config = load_config(overrides=[setting])
     (own / "folder").mkdir()
@@ -95,10 +95,6 @@ def test_a_changed_file_is_another_dataset_wherever_it_lies(own: Path) -> None:
     moved = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])
     assert moved.simulation_hash() == config.simulation_hash()
     assert re.fullmatch(r"my_sampler\.py:Ring@[0-9a-f]{16}", config.candidates.method[0])
-    with (own / "folder" / "my_sampler.py").open("a") as file:
-        file.write("# changed\n")
-    changed = load_config(overrides=["candidates.method=folder/my_sampler.py:Ring"])
-    assert changed.simulation_hash() != config.simulation_hash()
 
 
 @pytest.mark.parametrize(
@@ -179,9 +175,7 @@ MADE = "class Mine:\n  def __init__(self, model"
         ),
         (poses, "yield np.eye(3)", r"Mine: pose 0 must be a pose, 4 x 4 .* of shape \(3, 3\)"),
         (poses, "yield np.eye(4); yield np.nan * np.eye(4)", r"pose 1 must be finite"),
-        (poses, "return None", r"Mine: must run, got TypeError"),
         (poses, "yield 1 / 0", r"mine\.py:Mine: must run, got ZeroDivisionError in line 4 \("),
-        (barrett, "0.3", r"pose 1 must have a shape \(preshape, spread in rad\), got float"),
         (barrett, "(None, 22.5)", r"pose 1: spread must be 0 to 3\.14 rad .*, got 22\.5$"),
         (barrett, "('pinch', 0)", r"preshape must be None .* barrett, got 'pinch'$"),
         (

@@ -114,16 +114,6 @@ def test_second_build_simulates_nothing_and_opens_each_shard_once(
     assert {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")} == before
 
 
-def test_changed_mesh_is_done_again_and_the_others_are_not(
-    meshes: Path, out: Path, small_config: Config
-) -> None:
-    # No hand closes around it, so that there is little to simulate.
-    trimesh.creation.box([0.15, 0.15, 0.12]).export(meshes / "10_box_tall.obj")
-    report = build(meshes, out, small_config)
-    assert (report.simulated, report.reused) == (4, 8)
-    assert check_dataset(out) == []
-
-
 def test_object_keeps_to_what_is_said_of_it(meshes: Path, out: Path, small_config: Config) -> None:
     """A changed entry of objects.yaml prepares and simulates that object again, and no other."""
     said = "objects: {11_box_slim: {density: 600, friction: 0.9}}\n"

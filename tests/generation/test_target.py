@@ -97,13 +97,8 @@ def test_result_does_not_depend_on_units_that_were_run_in_vain(
     alone = run(make_target(floors, **ends))
     assert run(make_target(floors, **ends), workers) == alone
     assert (alone["late"], alone["later"]) == (65, 61)
-
-
-def test_units_of_a_build_that_was_killed_change_nothing() -> None:
-    """The killed build had many workers, and the one that continues finds their units."""
-    floors = dict.fromkeys(EVERY, 0)
-    alone = run(make_target(floors, samples=60))
-    again = make_target(floors, samples=60)
+    # A killed build had many workers, and the one that continues finds their units.
+    again = make_target(floors, **ends)
     for name in EVERY:
         for unit in units(name, DRAWN[name])[::-1][::2]:
             end(again, unit)
@@ -112,18 +107,15 @@ def test_units_of_a_build_that_was_killed_change_nothing() -> None:
 
 def test_each_object_has_the_number_of_each() -> None:
     target = make_target(samples_per_object=5)
-    assert samples(run(target)) == {"rich": 5, "poor": 5, "barren": 0, "short": 3}
+    taken = run(target)
+    assert samples(taken) == {"rich": 5, "poor": 5, "barren": 0, "short": 3}
+    assert taken["barren"] == PATIENCE
+    assert run(make_target(taken, samples_per_object=5)) == taken
     given_up, spent = target.warnings()
     assert "given up after 60 palm poses" in given_up
     assert "barren (0)" in given_up
     assert "all palm poses were tried" in spent
     assert "short (3)" in spent
-
-
-def test_object_is_given_up_after_its_patience_and_stays_so() -> None:
-    taken = run(make_target(samples_per_object=5))
-    assert taken["barren"] == 60
-    assert run(make_target(taken, samples_per_object=5)) == taken
 
 
 @pytest.mark.parametrize("workers", [1, 3])

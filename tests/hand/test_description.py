@@ -5,7 +5,6 @@ A configuration is complete when it is loaded: what it leaves open is the hand's
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from helpers.hands import (
     PINCER,
     PINCER_SDF,
     changed_finger,
-    drake_fingertip_poses,
     write_pincer,
     write_slider,
     write_tongs,
@@ -27,14 +25,10 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.config import CarriedHand
 from drakegrasp.errors import HandError
-from drakegrasp.hand.checks import overlap_query
 from drakegrasp.hand.description import SLIDE, Hand, load_hand
-from drakegrasp.hand.file_format import MODELS
-from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import (
     closing_levers,
     coordinate_limits,
-    fingertip_poses,
     joint_positions,
 )
 from drakegrasp.hand.parsing import add_model, declared_masses, read_xml
@@ -76,36 +70,11 @@ def test_collision_shapes_fill_the_cad_bounding_boxes(hand: Hand) -> None:
         np.testing.assert_allclose(p_L.max(axis=0), upper, atol=4e-3)
 
 
-@pytest.mark.parametrize("spread_deg", [0.0, 11.25, 22.5, 90.0])
-def test_open_fingers_do_not_touch_each_other(hand: Hand, spread_deg: float) -> None:
-    overlaps = overlap_query(hand.model, hand.palm_link)
-
-    def meeting(spread: float, closing: list[float]) -> set[frozenset[str]]:
-        """Return the pairs of fingers of which two links overlap."""
-        met = overlaps(joint_positions(hand, spread, closing))
-        pairs = {frozenset(link.partition("_")[0] for link in links) for links, _ in met}
-        return {pair for pair in pairs if len(pair) == 2 and "base" not in pair}
-
-    assert meeting(np.deg2rad(spread_deg), [0.0, 0.0, 0.0]) == set()
-    # Those that are closed do, at a spread.
-    assert len(meeting(np.pi / 2.0, [2.4, 2.4, 2.4])) == 3
-
-
 def test_a_hand_of_two_fingers_without_spread_loads(tmp_path: Path) -> None:
     pincer = load_hand(write_pincer(tmp_path))
     assert (pincer.name, pincer.num_fingers) == ("pincer", 2)
     assert pincer.spread.joints == ()
     np.testing.assert_array_equal(coordinate_limits(pincer), [[0, 0], [-0.1, 1], [0, 1]])
-    # Each finger leans inwards by its own angle about its hinge, 10 mm above the palm frame.
-    X_GF = fingertip_poses(pincer, spread=0.0, closing=[0.2, 0.5])
-    for X, finger, y, angle in zip(X_GF, pincer.fingers, (-0.04, 0.04), (0.2, 0.5), strict=True):
-        inward, (s, c) = -np.sign(y), (np.sin(angle), np.cos(angle))
-        p_GP = X[:3, :3] @ finger.p_FiP + X[:3, 3]
-        expected = [0.0, y + inward * (0.09 * s + 0.01 * c), 0.01 + 0.09 * c - 0.01 * s]
-        np.testing.assert_allclose(p_GP, expected, atol=1e-12)
-    np.testing.assert_allclose(
-        X_GF, drake_fingertip_poses(pincer, 0.0, np.array([0.2, 0.5])), atol=1e-12
-    )
 
 
 @pytest.mark.parametrize(
@@ -150,13 +119,6 @@ def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
         assert np.ptp(shape, axis=0) == pytest.approx([0.02, edge, 0.09])
 
 
-def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:
-    with pytest.raises(
-        HandError, match=r"hand must be one of allegro, .*leap or a YAML file, got 'shadow'"
-    ):
-        load_hand("shadow")
-
-
 REFUSALS = table("hand_file")
 
 
@@ -194,34 +156,6 @@ def test_a_joint_of_another_finger_is_refused(tmp_path: Path, key: str) -> None:
         load_hand(path)
 
 
-def test_digest_tells_changed_files_of_one_hand_apart(tmp_path: Path) -> None:
-    """YAML, SDFormat and every mesh in it count; a copy elsewhere is the same hand."""
-    for source in MODELS.glob("barrett_*"):
-        shutil.copy(source, tmp_path)
-    copy = tmp_path / "barrett_hand.yaml"
-    assert hand_digest(copy) == hand_digest("barrett")
-    digests = {hand_digest("barrett")}
-    for name in ("barrett_hand.yaml", "barrett_hand.sdf", "barrett_distal.obj"):
-        path = tmp_path / name
-        path.write_text(path.read_text() + ("\n" if name.endswith(".sdf") else "\n# changed\n"))
-        digests.add(hand_digest(copy))
-    assert len(digests) == 4
-    with pytest.raises(HandError, match="hand must be one of allegro"):
-        hand_digest("octopus")
-
-
-def test_a_preshape_fixes_joints_at_their_positions(tmp_path: Path) -> None:
-    """The right finger stands still, and its joint is none that a coordinate drives."""
-    fingers = changed_finger()[:1]
-    hand = load_hand(write_pincer(tmp_path, fingers=fingers, preshape={"right_hinge": 0.3}))
-    assert hand.locked_joints == ("right_hinge",)
-    assert joint_positions(hand, 0.0, [0.5]) == {"left_hinge": 0.5, "right_hinge": 0.3}
-    np.testing.assert_array_equal(coordinate_limits(hand), [[0.0, 0.0], [-0.1, 1.0]])
-    chain = hand.link_chains["right"]
-    assert not chain.gain.any()
-    np.testing.assert_array_equal(chain.offset, [0.3])
-
-
 @pytest.mark.parametrize("offset", [0.0, 0.8])
 def test_a_coupling_that_stops_first_limits_its_finger(tmp_path: Path, offset: float) -> None:
     """The right hinge, 0..1, stands at offset - 2 c, where c is -0.1..1."""
@@ -236,11 +170,6 @@ def test_fingers_slide(tmp_path: Path) -> None:
     np.testing.assert_allclose(hand.closing_speed, [0.1, 0.1])
     np.testing.assert_allclose(hand.closing_unit, [SLIDE, SLIDE])
     assert hand.fingers[0].effort_unit == "N"
-    X_GF = fingertip_poses(hand, spread=0.0, closing=[0.01, 0.03])
-    np.testing.assert_allclose(X_GF[:, 1, 3], [-0.03, 0.01], atol=1e-12)
-    np.testing.assert_allclose(
-        X_GF, drake_fingertip_poses(hand, 0.0, np.array([0.01, 0.03])), atol=1e-12
-    )
     np.testing.assert_allclose(closing_levers(hand, [0.01, 0.03]), [1.0, 1.0])
 
 
@@ -265,13 +194,6 @@ def test_stand_offs_and_spreads_are_the_hands_own_unless_they_are_set(tmp_path: 
     config = load_config(overrides=["candidates.standoffs=[0.01]"], hand="franka")
     assert config.candidates.standoffs == (0.01,)
     assert config.candidates.spreads_deg == (0.0,)
-
-
-def test_null_is_the_hands_own() -> None:
-    config = load_config("released")
-    assert config.candidates.standoffs == (0.04, 0.07, 0.10)
-    own = override_config(config, ["candidates.standoffs=null"])
-    assert own.candidates.standoffs == load_config().candidates.standoffs
 
 
 def test_null_is_that_of_the_hand_that_a_dataset_carries(tmp_path: Path) -> None:
@@ -299,12 +221,3 @@ def test_hand_that_is_not_there_is_refused_where_it_is_needed() -> None:
         load_config(hand="no_hand")
     given = ["candidates.standoffs=[0.01]", "candidates.spreads_deg=[0]"]
     assert load_config(overrides=given, hand="no_hand").hand == "no_hand"
-
-
-def test_file_of_a_hand_is_stored_as_an_absolute_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_pincer(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    assert load_config(hand=path.name).hand == str(path)
-    assert override_config(load_config(), [], hand=path.name).hand == str(path)

@@ -59,21 +59,6 @@ def test_forward_kinematics_agrees_with_the_table(hand: Hand, row: str) -> None:
     np.testing.assert_allclose(X_BFi[:3, :3] @ N_FiV, n, atol=1e-3)
 
 
-def test_many_postures_are_evaluated_as_one_by_one(hand: Hand) -> None:
-    rng = np.random.default_rng(1)
-    spread, closing = rng.random((4, 1)), rng.random((4, 2, 3))
-    X_GF = fingertip_poses(hand, spread=spread, closing=closing)
-    assert X_GF.shape == (4, 2, 3, 4, 4)
-    one = fingertip_poses(hand, spread=spread[3, 0], closing=closing[3, 1])
-    np.testing.assert_allclose(X_GF[3, 1], one, atol=1e-15)
-
-
-def test_coordinate_limits_are_those_of_the_joints_that_stop_first(hand: Hand) -> None:
-    # 48 degrees of the distal joint are 144 of the proximal one, which stops at 140.
-    expected = np.deg2rad([[0, 180], [0, 140], [0, 140], [0, 140]])
-    np.testing.assert_allclose(coordinate_limits(hand), expected, atol=1e-8)
-
-
 def test_closing_must_be_one_angle_per_finger(hand: Hand) -> None:
     with pytest.raises(ValueError, match=r"closing must have shape \(\.\.\., 3\), got \(2,\)"):
         fingertip_poses(hand, spread=0.0, closing=[0.1, 0.2])
@@ -156,11 +141,6 @@ ALLEGRO = """
 #: Closing position [m]; y of the pads' centres in the hand's frame, z 103.4 mm [mm]; franka_ros
 #: @c11f000 and franka_description @b299b39.
 FRANKA = ((0.0, 40.0), (0.01, 30.0), (0.02, 20.0), (0.03, 10.0), (0.035, 5.0), (0.04, 0.0))
-#: Number of fingers and of numbers in a grasp.
-FINGERS = {
-    "allegro": (3, 18), "allegro_four": (4, 24), "barrett": (3, 18), "franka": (2, 12),
-    "leap": (3, 18),
-}  # fmt: skip
 #: Points of the tips in the fingertip links [m]; closing angle [rad], and where they are in {G}
 #: [mm], from the joint table of dex-urdf @93505db and LEAP_Hand_Sim @150bc3d.
 LEAP_TIPS = np.array([[0.0, -0.038, 0.0145], [0.0, -0.038, 0.0145], [0.0, -0.050, -0.0145]])
@@ -173,16 +153,6 @@ LEAP = """
 
 def points(X_GF: Array, p_FP: Array) -> Array:
     return np.asarray(np.einsum("kab,kb->ka", X_GF[:, :3, :3], p_FP) + X_GF[:, :3, 3])
-
-
-def test_these_hands_come_with_the_package() -> None:
-    assert hand_names() == list(FINGERS)
-    for name, (fingers, numbers) in FINGERS.items():
-        hand = load_hand(name)
-        assert (hand.name, hand.num_fingers) == (name, fingers)
-        assert 6 * hand.num_fingers == numbers
-        assert hand.payload is not None
-    assert load_hand("barrett").rated_load == 19.62
 
 
 @pytest.mark.parametrize(
@@ -205,7 +175,7 @@ def test_franka_is_where_its_figures_put_it(closing: float, y: float) -> None:
     np.testing.assert_allclose(1e3 * p_BP, [[0.0, y, 103.4], [0.0, -y, 103.4]], atol=0.01)
 
 
-@pytest.mark.parametrize("name", FINGERS)
+@pytest.mark.parametrize("name", hand_names())
 def test_kinematics_agrees_with_drake(name: str) -> None:
     hand, rng = load_hand(name), np.random.default_rng(1)
     lower, upper = coordinate_limits(hand).T
@@ -215,10 +185,3 @@ def test_kinematics_agrees_with_drake(name: str) -> None:
             drake_fingertip_poses(hand, spread, np.array(closing)),
             atol=1e-12,
         )
-
-
-def test_limits_are_those_of_all_joints_that_a_finger_moves() -> None:
-    """The second joint starts at 0.2 rad and ends first, at 1.709 rad."""
-    limits = coordinate_limits(load_hand("allegro"))
-    np.testing.assert_allclose(limits[:2], [[0.0, 0.0], [-0.196, 1.509]], atol=1e-12)
-    np.testing.assert_array_equal(coordinate_limits(load_hand("franka"))[1:], [[0.0, 0.04]] * 2)

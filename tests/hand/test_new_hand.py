@@ -85,21 +85,6 @@ def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
     assert limits[1] < 0.5 * limits[0]
 
 
-@pytest.mark.parametrize(
-    ("in_model", "answer", "message"),
-    [
-        ("60", 2000.0, r"^--effort must be 0\.5\.\.1000 N for joint 'left_slide', got 2000$"),
-        ("2000", None, r"joint 'left_slide' must be .* got 2000 in the model"),
-    ],
-)
-def test_an_effort_that_no_motor_has_is_named_with_its_source(
-    tmp_path: Path, in_model: str, answer: float | None, message: str
-) -> None:
-    text = JAWS.replace('effort="60"', f'effort="{in_model}"')
-    with pytest.raises(HandError, match=message):
-        draft(tmp_path, text, effort=answer)
-
-
 def test_the_hand_of_the_package_is_drafted_from_its_model(tmp_path: Path) -> None:
     """From SDFormat, with meshes; joints that spread fingers keep a position."""
     drafted = draft_hand(MODELS / "barrett_hand.sdf", tmp_path / "out", answers=Answers(effort=2.0))
@@ -135,24 +120,35 @@ def test_answers_override_guesses(tmp_path: Path) -> None:
     assert "middle_1" not in whole.get("preshape", {})
 
 
-def test_fingers_that_close_side_by_side_are_no_hand(tmp_path: Path) -> None:
-    """The message says what may be answered."""
-    with pytest.raises(HandError, match=r"close against each other: .* --fingers LINK,LINK"):
-        draft(tmp_path, MITTEN, fingers=("index_far", "middle_far"))
-
-
 @pytest.mark.parametrize(
-    ("answers", "message"),
+    ("text", "answers", "message"),
     [
-        ({"palm": "wrist"}, r"--palm must be one of body, .* got 'wrist'"),
-        ({"fingers": ("left_jaw", "thumb")}, r"--fingers must be of .* got 'thumb'"),
+        (JAWS, {"palm": "wrist"}, r"--palm must be one of body, .* got 'wrist'"),
+        (JAWS, {"fingers": ("left_jaw", "thumb")}, r"--fingers must be of .* got 'thumb'"),
+        # Fingers that close side by side: the message says what may be answered.
+        (
+            MITTEN,
+            {"fingers": ("index_far", "middle_far")},
+            r"close against each other: .* --fingers LINK,LINK",
+        ),
+        # An effort that no motor has is named with its source.
+        (
+            JAWS,
+            {"effort": 2000.0},
+            r"^--effort must be 0\.5\.\.1000 N for joint 'left_slide', got 2000$",
+        ),
+        (
+            JAWS.replace('effort="60"', 'effort="2000"'),
+            {},
+            r"joint 'left_slide' must be .* got 2000 in the model",
+        ),
     ],
 )
-def test_an_answer_that_cannot_be_used_is_refused(
-    tmp_path: Path, answers: dict[str, object], message: str
+def test_what_cannot_be_a_hand_is_refused(
+    tmp_path: Path, text: str, answers: dict[str, object], message: str
 ) -> None:
     with pytest.raises(HandError, match=message):
-        draft(tmp_path, JAWS, **answers)
+        draft(tmp_path, text, **answers)
     assert not (tmp_path / "out").exists()
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,16 +10,14 @@ import yaml
 from helpers.hands import SLIDER, copy_model, slider_fingers, write_slider
 from helpers.successes import good, judge
 
-from drakegrasp.config import CandidateConfig, FilterConfig
+from drakegrasp.config import FilterConfig
 from drakegrasp.errors import HandError
 from drakegrasp.exchange.dexgraspbench import grasp_dictionary
 from drakegrasp.exchange.export import ClosedGrasp
 from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.filters import Removal
 from drakegrasp.frames import make_pose
-from drakegrasp.generation.attempts import TrialSetup, trial_rows
 from drakegrasp.grasp import unused_fingers
-from drakegrasp.hand.checks import check_couplings
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.kinematics import (
     closed_positions,
@@ -30,15 +26,8 @@ from drakegrasp.hand.kinematics import (
     joint_positions,
     open_together,
 )
-from drakegrasp.hand.settings import load_config
-from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.still_scene import StillScene
-from drakegrasp.simulation.attempt import Attempt, Source
-from drakegrasp.simulation.candidates import Candidates, palm_attempts
-from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.posture import Posture, start_of
-from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.verification.wrist_solver import fit_wrist, make_postures
 
 PINCH = {
@@ -98,45 +87,6 @@ def test_a_preshape_includes_the_finger_whose_motor_drives_its_own(tmp_path: Pat
         allegro(tmp_path, half, name="franka")
 
 
-def test_preshapes_are_drawn_after_the_spreads() -> None:
-    """So spreads are the same with and without them, whatever the number of either."""
-    count = 40
-    drawn = Candidates(
-        X_OG=np.tile(np.eye(4), (count, 1, 1)),
-        distance=np.ones(count),
-        resting=np.zeros(count, dtype=np.int64),
-        source=np.zeros(count, dtype=np.int64),
-        spread=np.full(count, np.nan),
-        preshape_index=np.full(count, -1),
-    )
-    rules = CandidateConfig(standoffs=(0.05, 0.07), spreads_deg=(0.0, 10.0, 20.0))
-
-    def attempts(preshapes: int) -> list:
-        made = palm_attempts(drawn, range(count), rules, name="x", seed=3, preshapes=preshapes)
-        return list(made)
-
-    without, shaped = attempts(0), attempts(3)
-    assert [a.spread for a in without] == [a.spread for a in shaped]
-    assert {a.preshape for a in without} == {None}
-    assert sorted({a.preshape for a in shaped}) == [0, 1, 2]
-    assert [a.preshape for a in attempts(3)] == [a.preshape for a in shaped]
-
-
-@pytest.mark.parametrize(("name", "none"), [("allegro_four", 255), ("allegro", 0)])
-def test_a_posture_is_not_stored_as_of_the_first_preshape(
-    name: str, none: int, cube: ObjectModel
-) -> None:
-    hand, X, config = load_hand(name), np.eye(4), load_config(overrides=[f"hand={name}"])
-    scene = build_scene(cube, config.physics, hand)
-    setup = TrialSetup(prepared=SimpleNamespace(model=cube), config=config, scene=scene)
-    place = {"candidate": 0, "standoff_index": 0, "standoff": np.nan, "spread": 0.0, "seed": 0}
-    posture = Attempt(X_OG=X, source=Source.POSTURES, **place)
-    drawn = replace(posture, source=Source.NORMALS, preshape=0 if hand.preshapes else None)
-    record = TrialRecord(outcome=Outcome.START_COLLISION, X_TO=X, X_OG=X)
-    rows = trial_rows(setup, [posture, drawn], [record] * 2)
-    assert rows["preshape"].tolist() == [none, 0]
-
-
 def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:
     """A NaN of another finger is off the surface; outliers are sought among the same fingers."""
     grasps = good(40)
@@ -192,10 +142,8 @@ def test_exports_leave_the_fingers_that_a_grasp_does_not_use_where_they_are(tmp_
 
 
 def test_bits_say_which_fingers_are_left_out() -> None:
-    np.testing.assert_array_equal(
-        unused_fingers([0, 1, 6], 3),
-        [[False, False, False], [True, False, False], [False, True, True]],
-    )
+    left_out = [[False, False, False], [True, False, False], [False, True, True]]
+    np.testing.assert_array_equal(unused_fingers([0, 1, 6], 3), left_out)
 
 
 OWN, DRIVEN = slider_fingers(60.0, finger="left")
@@ -276,13 +224,3 @@ def test_a_wrist_brings_both_fingers_to_their_points(tmp_path: Path) -> None:
     best = fit_wrist(hand, p_OQ, outward, make_pose(np.eye(3), [0.0, 0.0, 0.5]))[0]
     assert best.closing[0] == best.closing[1] == pytest.approx(0.02, abs=1e-3)
     assert best.residual.max() < 5e-4
-
-
-def test_hand_check_asks_for_the_motor_that_the_model_shares(tmp_path: Path) -> None:
-    """Its fingers mimic each other in the URDF."""
-    finding = check_couplings(load_hand(write_slider(tmp_path)))
-    assert not finding.ok
-    assert "'right_slide' must be coupled to 'left_slide' by 1 and 0" in finding.text
-    assert check_couplings(shared(tmp_path)).ok
-    other = check_couplings(shared(tmp_path, ratio=2.0))
-    assert not other.ok

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
+from helpers.commands import run
+from helpers.tables import table
+from helpers.vendors import JAWS, JAWS_MJCF, link, write_mesh, write_model
 
 from drakegrasp.errors import HandError, MachineError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.draft.source import read_model
+from drakegrasp.hand.file_format import MODELS
+from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.hand_setup import draft_hand
 
 JAW_BOX = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
@@ -24,15 +30,6 @@ def with_mesh(uri: str) -> str:
     old = f'<collision><origin xyz="0 0.006 0.03"/>{JAW_BOX}'
     assert old in JAWS
     return JAWS.replace(old, f'<collision><origin xyz="0 0.006 0.03"/>{MESH.format(uri)}')
-
-
-def test_frames_without_mass_become_part_of_their_parents(tmp_path: Path) -> None:
-    model = read_model(write_model(tmp_path, JAWS))
-    assert model.root == "body"
-    assert set(model.links) == {"body", "left_jaw", "right_jaw"}
-    assert [joint.name for joint in model.joints.values()] == ["left_slide", "right_slide"]
-    # The body keeps its own frame, not that of the mount.
-    np.testing.assert_allclose(model.links["body"].corners().max(axis=0), [0.03, 0.07, 0.0])
 
 
 def test_masses_of_welded_links_add_up(tmp_path: Path) -> None:
@@ -119,10 +116,10 @@ def test_mjcf_is_read_as_mujoco_compiles_it(
     mujoco.mj_forward(peer, data)
     X_WR = np.eye(4)
     X_WR[:3, :3], X_WR[:3, 3] = data.body("body").xmat.reshape(3, 3), data.body("body").xpos
-    for name, link in model.links.items():
-        assert link.inertia.get_mass() == pytest.approx(float(peer.body(name).mass[0]))
+    for name, part in model.links.items():
+        assert part.inertia.get_mass() == pytest.approx(float(peer.body(name).mass[0]))
         X_WL = X_WR @ model.pose(name, drawn)
-        centre = X_WL[:3, :3] @ link.inertia.get_com() + X_WL[:3, 3]
+        centre = X_WL[:3, :3] @ part.inertia.get_com() + X_WL[:3, 3]
         np.testing.assert_allclose(centre, data.body(name).xipos, atol=1e-9)
 
 
@@ -275,13 +272,6 @@ def test_a_collision_mesh_is_a_hull_of_few_corners(tmp_path: Path) -> None:
     assert trimesh.Trimesh(shape.vertices, shape.faces).volume > 0.9 * ball.volume
 
 
-def test_a_link_without_collision_shapes_gets_those_of_its_pictures(tmp_path: Path) -> None:
-    text = JAWS.replace(f'<collision><origin xyz="0 0.006 0.03"/>{JAW_BOX}</collision>', "")
-    model = read_model(write_model(tmp_path, text))
-    assert len(model.links["left_jaw"].collisions) == 1
-    assert "link left_jaw: the model has no collision shapes; hulls of its pictures" in model.notes
-
-
 def test_a_link_without_a_mass_gets_one_by_its_size(tmp_path: Path) -> None:
     text = JAWS.replace('<mass value="0.05"/>', '<mass value="0"/>', 1)
     model = read_model(write_model(tmp_path, text))
@@ -299,3 +289,136 @@ def test_packages_are_folders_above_or_given_ones(tmp_path: Path) -> None:
     with pytest.raises(HandError, match=r"must lie in a known package: .* --package pkg=FOLDER"):
         read_model(outside)
     assert read_model(outside, packages={"pkg": tmp_path / "pkg"}).links["left_jaw"].collisions
+
+
+# Spoilt models: each is refused in one line that names the fault
+
+
+MIMIC = '<mimic joint="left_slide"/>'
+EMPTY = '<model name="{}"><link name="x"/></model>'
+# fmt: off
+#: Of a file of its own: its text, its name, and what is said of it.
+FILES = {
+    "not XML": ("<robot", "hand.urdf", "must be XML, got text that is not"),
+    "another language": ("<html/>", "hand.urdf", "does not contain a robot tag"),
+    "xacro": (JAWS, "hand.xacro", "must be URDF, got xacro: run `xacro hand.xacro"),
+    "another suffix": (JAWS, "hand.step", r"must end in \.urdf, \.sdf or \.xml"),
+    "XML bomb": ('<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]>'
+                 + JAWS.replace('name="jaws"', 'name="&b;"'), "hand.urdf", "document type"),
+    "deep": ("<robot>" + "<a>" * 5000 + "</a>" * 5000 + "</robot>", "hand.urdf", "DEPTH_EXCEEDED"),
+    "no shapes": (re.sub(r"<(collision|visual)>.*?</\1>", "", JAWS), "hand.urdf",
+                  "must have shapes, got links without any"),
+    "joint that floats": (
+        re.sub('(right_slide" type=")prismatic', r"\1planar", JAWS.replace(MIMIC, "")),
+        "hand.urdf", "joint 'right_slide' must be revolute, prismatic or fixed"),
+    "no joints": (f'<robot name="block">{link("body", 0.5, JAW_BOX)}</robot>', "hand.urdf",
+                  r"must have two fingers or more, got one chain .* --palm LINK \(body\)"),
+    "two models": (f'<sdf version="1.7">{"".join(map(EMPTY.format, "ab"))}</sdf>', "hand.sdf",
+                   "can only contain one model"),
+    "other files": ('<sdf version="1.7"><model name="a"><include><uri>model://b</uri></include>'
+                    "</model></sdf>", "hand.sdf", "must be complete by itself, got '<include'"),
+    "missing mesh of MJCF": ('<mujoco><asset><mesh file="lost.stl"/></asset></mujoco>', "hand.xml",
+                             "lost.stl: must be a readable file, got: No such file"),
+}
+# fmt: on
+
+
+TABLE = table("spoilt_models")
+
+
+def changed(text: str, old: str, new: str, count: int = -1) -> str:
+    assert old in text
+    return text.replace(old, new, count)
+
+
+SPOILT = (
+    FILES
+    | {name: (changed(JAWS, *row[:3]), "hand.urdf", row[3]) for name, row in TABLE["urdf"].items()}
+    | {
+        name: (changed(JAWS_MJCF, *row[:3]), "hand.xml", row[3])
+        for name, row in TABLE["mjcf"].items()
+    }
+)
+
+
+@pytest.mark.parametrize("fault", SPOILT)
+def test_a_spoilt_model_is_refused_in_one_line(tmp_path: Path, fault: str) -> None:
+    """Nothing is left behind."""
+    text, name, message = SPOILT[fault]
+    path = write_model(tmp_path, text, name)
+    (tmp_path / "broken.glb").write_bytes(bytes(range(256)))
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    (tmp_path / "tip.gltf").write_text("{}")
+    (tmp_path / "jaw.step").write_text("ISO-10303-21;")
+    out = tmp_path / "out"
+    result = run("hand", "new", str(path), "--out", str(out))
+    assert result.exit_code == 2, result.output
+    assert len(result.output.strip().splitlines()) == 1, result.output
+    assert re.search(message, result.output), result.output
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("word", ["0,05", "0.05m", "nan", "0_1"])
+@pytest.mark.parametrize(
+    ("name", "text", "old", "new"),
+    [
+        ("hand.urdf", JAWS, 'upper="0.05"', 'upper="{}"'),
+        ("hand.urdf", JAWS, 'xyz="0 1 0"', 'xyz="{} {} {}"'),
+        ("hand.urdf", JAWS, 'ixx="1e-4"', 'ixx="{}"'),
+        ("hand.urdf", JAWS, MIMIC, '<mimic joint="left_slide" multiplier="{}"/>'),
+        ("hand.xml", JAWS_MJCF, 'range="0 0.05"', 'range="{} {}"'),
+        ("hand.xml", JAWS_MJCF, 'mass="0.05"', 'mass="{}"'),
+    ],
+)
+def test_what_is_no_number_is_refused(
+    tmp_path: Path, name: str, text: str, old: str, new: str, word: str
+) -> None:
+    """Drake reads the start of a single number, and MuJoCo its default."""
+    path = write_model(tmp_path, changed(text, old, new.replace("{}", word), 1), name)
+    with pytest.raises(HandError, match=r"must be a number|Expected|bad format|which is no number"):
+        read_model(path)
+
+
+def test_fault_of_an_sdformat_file_is_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("allegro_hand.sdf", "allegro_hand.yaml", "allegro_fingertip.obj"):
+        shutil.copyfile(MODELS / name, tmp_path / name)
+    model = tmp_path / "allegro_hand.sdf"
+    model.write_text(model.read_text().replace("<pose>0 ", "<pose>", 1))
+    with pytest.raises(HandError, match="Error reading element <pose>"):
+        load_hand(tmp_path / "allegro_hand.yaml")
+    with pytest.raises(HandError, match="Error reading element <pose>"):
+        read_model(model)
+    assert caplog.text == ""
+
+
+def test_pipe_in_place_of_a_model_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "hand.urdf")
+    with pytest.raises(HandError, match=r"hand\.urdf: must be a readable file, got: a pipe"):
+        read_model(tmp_path / "hand.urdf")
+
+
+@pytest.mark.parametrize(
+    ("hand", "name", "spoil", "said"),
+    [
+        ("barrett", "barrett_palm_plate.obj", (r"(?m)^v \S+", "v 26.5"),
+         r"within 3 m of it, got one that reaches 26\.5 m"),
+        ("franka", "franka_hand.urdf", (r'<box size="\S+', '<box size="-0.5'),
+         r"must be a file of one model, got .*width = -0\.5"),
+        ("barrett", "barrett_palm_plate.obj", None, "plate.obj: must be a file, got a pipe, a s"),
+    ],
+)  # fmt: skip
+def test_spoilt_file_of_a_hand_is_refused(
+    tmp_path: Path, hand: str, name: str, spoil: tuple[str, str] | None, said: str
+) -> None:
+    for path in MODELS.glob(f"{hand}_*"):
+        shutil.copyfile(path, tmp_path / path.name)
+    text = (tmp_path / name).read_text()
+    (tmp_path / name).unlink()
+    if spoil is None:
+        (tmp_path / name).symlink_to("/dev/zero")
+    else:
+        (tmp_path / name).write_text(re.sub(*spoil, text, count=1))
+    with pytest.raises(HandError, match=said):
+        link_shapes(load_hand(tmp_path / f"{hand}_hand.yaml").model)

@@ -181,3 +181,28 @@ def test_nothing_moves_the_object_while_the_hand_closes(cube: ObjectModel) -> No
     data = baseline._data
     assert baseline._contacts().touching.any()
     assert np.abs(data.qacc[baseline._object_v]).max() < 0.01
+
+
+def test_a_worm_yields_beyond_what_it_holds_and_then_holds_again(
+    baseline: MujocoBaseline, cube: ObjectModel
+) -> None:
+    """While its finger opens, the motor pushes back with what the worm can hold."""
+    baseline.run(from_above(cube, 0.3))  # in the air: nothing pushes but the test
+    m, d, drive, finger = baseline._model, baseline._data, baseline._drive, load_hand().fingers[0]
+    joint, motor = m.joint(finger.closing_joint), m.actuator(finger.name)
+    (v,) = joint.dofadr
+    d.joint(joint.id).qpos = 1.0
+    held, yielding = (1.0, finger.effort_limit), (0.0, finger.holding_effort)
+    drive.engage(d)
+    for share, speed, (lower, torque) in (
+        (0.99, -1.0, held),
+        (1.01, -1.0, yielding),
+        (0.5, -0.1, yielding),
+        (0.5, 0.1, held),
+    ):
+        d.qfrc_applied[v], d.qvel[v] = -share * finger.holding_effort, speed
+        drive.update(d)
+        assert joint.range[0] == pytest.approx(lower)
+        assert motor.forcerange == pytest.approx([-torque, torque])
+    d.qfrc_applied[v] = 0.0
+    drive.disengage()

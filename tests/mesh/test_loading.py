@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ from helpers.mesh_files import (
     prism,
     write_file,
 )
-from helpers.meshes import BOX, assert_sound, box, prepare, without_faces, write
+from helpers.meshes import assert_sound, box, prepare, without_faces, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -33,38 +32,6 @@ from drakegrasp.mesh.loading import load_points, load_surface
 from drakegrasp.objects.audit import audit
 
 
-@pytest.mark.parametrize("suffix", ["obj", "STL", "ply", "glb"])
-def test_formats_agree(tmp_path, suffix):
-    path = tmp_path / f"a.{suffix}"
-    path.write_bytes(
-        box().export(file_type=suffix.lower(), **({"encoding": "ascii"} if suffix == "ply" else {}))
-        if suffix != "obj"
-        else box().export(file_type="obj").encode()
-    )
-    model = prepare(path)
-    assert_sound(model)
-    assert model.notes == () and len(model.visual_faces) == 12
-    np.testing.assert_allclose(model.half_extents, np.array(BOX) / 2.0, rtol=1e-6)
-
-
-def test_scene_is_put_together_with_its_transforms(tmp_path):
-    scene = trimesh.Scene()
-    shared = box((0.1, 0.1, 0.1))
-    turn = trimesh.transformations.rotation_matrix(np.pi / 2.0, [0.0, 0.0, 1.0])
-    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
-    for i, (X, x) in enumerate(((turn, 0.0), (mirror, 0.3))):
-        X = X.copy()
-        X[0, 3] = x
-        scene.add_geometry(shared, node_name=f"n{i}", geom_name="shared", transform=X)
-    path = tmp_path / "scene.glb"
-    path.write_bytes(scene.export(file_type="glb"))
-    model = prepare(path)
-    assert_sound(model)
-    assert model.volume == pytest.approx(2e-3, rel=1e-6)
-    np.testing.assert_allclose(model.half_extents, [0.2, 0.05, 0.05], rtol=1e-6)
-    assert "2 parts do not touch and will move as one" in model.notes
-
-
 def nan_box() -> trimesh.Trimesh:
     mesh = box()
     mesh.vertices[3, 1] = np.nan
@@ -72,16 +39,9 @@ def nan_box() -> trimesh.Trimesh:
 
 
 def moebius() -> trimesh.Trimesh:
-    n, vertices, faces = 24, [], []
-    for i in range(n):
-        t = 2 * np.pi * i / n
-        for s in (-0.02, 0.02):
-            r = 0.1 + s * np.cos(t / 2)
-            vertices.append([r * np.cos(t), r * np.sin(t), s * np.sin(t / 2)])
-    for i in range(n - 1):
-        faces += [[2 * i, 2 * i + 1, 2 * i + 2], [2 * i + 1, 2 * i + 3, 2 * i + 2]]
-    faces += [[2 * n - 2, 2 * n - 1, 1], [2 * n - 1, 0, 1]]
-    return trimesh.Trimesh(vertices, faces, process=False)
+    angle = 0.4 * np.pi * np.arange(5)
+    corners = 0.1 * np.column_stack([np.cos(angle), np.sin(angle), np.sin(3.0 * angle)])
+    return trimesh.Trimesh(corners, [np.arange(i, i + 3) % 5 for i in range(5)], process=False)
 
 
 def tetrahedron() -> trimesh.Trimesh:
@@ -94,29 +54,20 @@ def hemisphere() -> trimesh.Trimesh:
     return without_faces(ball, ball.triangles_center[:, 2] < 0.0)
 
 
-GLB = box().export(file_type="glb")
-
-
 UNUSABLE = {
     "text": ("a.obj", b"this is a shopping list\n", "must hold triangles, got no faces"),
     "empty": ("a.stl", b"", "got an empty file"),
     "points": ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n"
                b"property float y\nproperty float z\nend_header\n0 0 0\n", "no faces"),
-    "garbage stl": ("a.stl", struct.pack("<80sI", b"x", 10**6) + b"abc", "a.stl: must"),
-    "garbage ply": ("a.ply", b"\x00\xff\xfe" * 30, "valid .ply mesh"),
-    "truncated glb": ("a.glb", GLB[: len(GLB) // 2], "valid .glb mesh"),
-    "index": ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "a.obj: (must be|faces must)"),
     "degenerate": ("a.obj", b"v 0 0 0\nv 1 0 0\nf 1 2 2\n", "only degenerate faces"),
     "nan": ("a.obj", nan_box(), r"must be finite, got NaN, inf or more than 1e\+09 at"),
     "light years": ("a.obj", box((1e12, 0.1, 0.1)), "must be finite, got NaN, inf or more"),
-    "wide": ("a.obj", "v 0 0 0".encode("utf-16"), "must hold triangles, got no faces"),
     "large": ("a.obj", box((6.0, 10.0, 4.0)), r"0\.01 m to 2 m, got 12\.33 m .* --units .*objects"),
     "small": ("a.obj", box((0.0006, 0.001, 0.0004)), "0.01 m to 2 m"),
     "sheet": ("a.obj", trimesh.Trimesh(np.diag([0.1] * 3), [[0, 1, 2]]), "got a flat sheet"),
     "thin": ("a.obj", box((0.1, 0.1, 0.0004)), "at least 0.5 mm thick, got 0.4 mm"),
     "speck": ("a.obj", tetrahedron(), r"at least 1e-09 m\^3, got 7.2e-10"),
     "bowl": ("a.obj", hemisphere(), "at most 25% of the surface, got 3[0-9]%"),
-    "latin": ("a.obj", b"# caf\xe9 \xff\xfe\nv 0 0 0\n", "(text that is not UTF-8|no faces)"),
     "moebius": ("a.obj", moebius(), "must have two sides"),
 }  # fmt: skip
 
@@ -241,27 +192,16 @@ def test_points_are_read_from_a_file_without_faces(tmp_path: Path) -> None:
 
 
 def test_node_is_scaled_then_turned_then_moved(tmp_path):
-    turn, scale, place = (
-        Rotation.from_euler("xyz", [0.4, 0.7, 1.1]),
-        [1.0, 2.0, 3.0],
-        [4.0, 5.0, 6.0],
-    )
-    pose = {"rotation": turn.as_quat().tolist(), "scale": scale, "translation": place}
-    mesh = load_mesh(write_file(tmp_path, "a.glb", nodes_glb({"mesh": 0, **pose})))
-    wanted = turn.apply(CUBE * scale) + place
-    found = [np.linalg.norm(mesh.vertices - corner, axis=1).min() for corner in wanted]
-    np.testing.assert_allclose(found, 0.0, atol=1e-6)
-
-
-def test_child_is_moved_in_the_axes_of_its_parent(tmp_path):
-    turn = Rotation.from_euler("xyz", [0.4, 0.7, 1.1])
-    parent = {"rotation": turn.as_quat().tolist(), "translation": [4.0, 5.0, 6.0]}
-    child = {"mesh": 0, "translation": [1.0, 2.0, 3.0]}
-
-    nodes = ({"children": [1], **parent}, child)
-    content = nodes_glb(*nodes, scene=0, scenes=[{"nodes": [0]}])
+    """In the axes of its parent, which was."""
+    turn, place = Rotation.from_euler("xyz", [0.4, 0.7, 1.1]), np.array([4.0, 5.0, 6.0])
+    scale, aside = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, -3.0])
+    pose = {"rotation": turn.as_quat().tolist(), "scale": scale.tolist()}
+    parent = {"children": [1], **pose, "translation": place.tolist()}
+    child = {"mesh": 0, **pose, "translation": aside.tolist()}
+    content = nodes_glb(parent, child, scene=0, scenes=[{"nodes": [0]}])
     mesh = load_mesh(write_file(tmp_path, "a.glb", content))
-    wanted = turn.apply(CUBE + np.array([1.0, 2.0, 3.0])) + np.array([4.0, 5.0, 6.0])
+    inner = turn.apply(CUBE * scale) + aside
+    wanted = turn.apply(inner * scale) + place
     found = [np.linalg.norm(mesh.vertices - corner, axis=1).min() for corner in wanted]
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
 

@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 import drakegrasp.mesh.components
 import drakegrasp.mesh.repair
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.components import part_touching_edges
-from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     is_solid_surface,
     signed_volume,
@@ -86,6 +84,12 @@ REPAIRED: dict[str, tuple[list[trimesh.Trimesh], float, str]] = {
         2e-3,
         r"\d+ pieces that enclose nothing were dropped",
     ),
+    "an edge in common": ([LEFT, box((0.1,) * 3, (0.1, 0.1, 0.0))], 2e-3, ""),
+    "apart": (
+        [LEFT, box((0.1,) * 3, (0.3, 0.0, 0.0))],
+        2e-3,
+        "2 parts do not touch",
+    ),
     "each face in both directions": ([box(), flipped(box())], VOLUME, ""),
     "a loose triangle": ([box(), SPECK], VOLUME, "1 pieces that enclose nothing were dropped"),
     "a seam that does not quite meet": (
@@ -101,16 +105,11 @@ def test_a_surface_becomes_one_solid_and_what_was_done_is_told(tmp_path, case):
     parts, volume, note = REPAIRED[case]
     model = prepare(write(tmp_path / "a.obj", *parts))
     assert_sound(model)
+    assert is_solid_surface(model.visual_faces.astype(np.int64))
     assert model.volume == pytest.approx(volume, rel=1e-3 if "seam" in case else 1e-9)
     inertia = model.visual.moment_inertia / model.volume
     np.testing.assert_allclose(model.I_OOcm_O, inertia, rtol=1e-6, atol=1e-10)
     assert not note or any(re.match(note, each) for each in model.notes)
-
-
-def test_bodies_that_share_an_edge_are_one_solid(tmp_path):
-    model = prepare(write(tmp_path / "a.obj", LEFT, box((0.1,) * 3, (0.1, 0.1, 0.0))))
-    assert model.volume == pytest.approx(2e-3, rel=1e-9)
-    assert is_solid_surface(model.visual_faces.astype(np.int64))
 
 
 def test_duplicate_and_degenerate_faces_are_dropped(tmp_path):
@@ -120,13 +119,6 @@ def test_duplicate_and_degenerate_faces_are_dropped(tmp_path):
     loaded = load_mesh(path)
     assert len(loaded.faces) == 12 and len(loaded.vertices) == 8
     assert prepare(path).volume == pytest.approx(np.prod(BOX))
-
-
-def test_winding_numbers_of_a_box():
-    cube = box()
-    points = np.array([[0.0, 0.0, 0.0], [0.029, 0.049, 0.019], [0.031, 0.0, 0.0], [5.0, 5.0, 5.0]])
-    w = winding_numbers(points, np.array(cube.vertices), np.array(cube.faces))
-    np.testing.assert_allclose(w, [1.0, 1.0, 0.0, 0.0], atol=1e-9)
 
 
 def test_whole_windings_are_those_of_the_solid_angles():
@@ -206,23 +198,3 @@ def test_what_passes_through_itself_is_kept_noted_or_refused(share, said, monkey
         return
     drakegrasp.mesh.components.check_self_intersection(*surface, notes)
     assert any("passes through" in note for note in notes) is (said == "noted")
-
-
-def test_touching_edge_gets_a_vertex_for_each_side():
-    """Two bricks share an edge; each keeps its own two faces at both halves of it."""
-    corner, other = box((0.02,) * 3), box((0.02,) * 3, (0.02, 0.02, 0.0))
-    vertices, faces = weld(
-        np.vstack((corner.vertices, other.vertices)), np.vstack((corner.faces, other.faces + 8))
-    )
-    assert not is_solid_surface(faces)
-    parted, new_faces = part_touching_edges(vertices, faces)
-    assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
-    np.testing.assert_allclose(parted[-2:], [[0.01, 0.01, 0.0]] * 2, atol=1e-12)
-    assert is_solid_surface(new_faces)
-    assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
-
-
-def test_signed_volume_does_not_depend_on_the_place():
-    cube = box(at=(100.0, -50.0, 7.0))
-    volume = signed_volume(np.array(cube.vertices), np.array(cube.faces))
-    assert volume == pytest.approx(np.prod(BOX), rel=1e-9)

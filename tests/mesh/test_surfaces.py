@@ -65,19 +65,6 @@ def test_no_rays_and_no_triangles(grids: np.ndarray) -> None:
     assert np.isinf(first_hits(grids[:0], *down(np.zeros((2, 2))))).all()
 
 
-@pytest.mark.parametrize("normals", [False, True])
-def test_obj_text_reads_back_exactly(tmp_path, normals):
-    mesh = trimesh.creation.icosphere(2, radius=0.1 / 3)
-    path = tmp_path / "a.obj"
-    path.write_text(obj_text(mesh.vertices, mesh.faces, normals=normals))
-    rows = [line.split() for line in path.read_text().splitlines()]
-    v = np.array([row[1:] for row in rows if row[0] == "v"], dtype=float)
-    f = np.array([[c.split("/")[0] for c in row[1:]] for row in rows if row[0] == "f"], dtype=int)
-    np.testing.assert_array_equal(v, mesh.vertices)
-    np.testing.assert_array_equal(f - 1, mesh.faces)
-    assert any(row[0] == "vn" for row in rows) == normals
-
-
 def test_normals_are_crisp_on_boxes_and_smooth_on_balls():
     def normals(mesh):
         rows = [r.split() for r in obj_text(mesh.vertices, mesh.faces, normals=True).splitlines()]

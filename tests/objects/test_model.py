@@ -22,19 +22,14 @@ from helpers.meshes import (
     prepare,
     write,
 )
+from helpers.objects import box_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drakegrasp.errors import MeshError
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.audit import audit, guess_units
-from drakegrasp.objects.model import (
-    ObjectModel,
-    fit_contacts,
-    load_object,
-    prepare_object,
-    save_object,
-)
+from drakegrasp.objects.model import fit_contacts, load_object, prepare_object, save_object
 from drakegrasp.objects.sources import MeshSource, find_meshes
 
 
@@ -157,12 +152,6 @@ def test_model_is_read_only_and_knows_its_source(tmp_path):
     assert len(digests) == 2
 
 
-def box_model(folder: Path, *edges: float) -> ObjectModel:
-    path = folder / "box.stl"
-    trimesh.creation.box(edges).export(path)
-    return prepare_object(MeshSource(name="box", class_name="box", path=path))
-
-
 def tilted(angle_deg: float) -> list[float]:
     """Return the normal +x turned towards +z."""
     angle = np.deg2rad(angle_deg)
@@ -170,7 +159,7 @@ def tilted(angle_deg: float) -> list[float]:
 
 
 def test_distance_and_angle_are_those_from_the_nearest_face(tmp_path: Path) -> None:
-    model = box_model(tmp_path, 0.06, 0.05, 0.10)
+    model = box_model(tmp_path, [0.06, 0.05, 0.10])
     points = np.array([[0.031, 0.0, 0.01], [0.0295, 0.01, 0.0], [0.0, 0.025, 0.0]])
     normals = np.array([tilted(20.0), tilted(-40.0), [0.0, -1.0, 0.0]])
     fit = fit_contacts(model, points, normals)
@@ -180,7 +169,7 @@ def test_distance_and_angle_are_those_from_the_nearest_face(tmp_path: Path) -> N
 
 def test_on_a_thin_wall_the_own_side_counts_though_the_other_is_nearer(tmp_path: Path) -> None:
     """A wall of 1 mm; the contact belongs to its +x side, however deep it lies in it."""
-    model = box_model(tmp_path, 0.001, 0.05, 0.10)
+    model = box_model(tmp_path, [0.001, 0.05, 0.10])
     points = np.array([[0.0004, 0.0, 0.0], [-0.0004, 0.0, 0.0]])
     fit = fit_contacts(model, points, np.array([tilted(10.0)] * 2))
     np.testing.assert_allclose(np.degrees(fit.normal_angle), 10.0, atol=1e-6)
@@ -188,7 +177,7 @@ def test_on_a_thin_wall_the_own_side_counts_though_the_other_is_nearer(tmp_path:
 
 def test_what_does_not_touch_or_has_no_direction(tmp_path: Path) -> None:
     """A fingertip that does not touch has neither; a normal that is NaN agrees with no face."""
-    model, missing = box_model(tmp_path, 0.06, 0.05, 0.10), [np.nan] * 3
+    model, missing = box_model(tmp_path, [0.06, 0.05, 0.10]), [np.nan] * 3
     points = np.array([missing, [0.031, 0.0, 0.0], [0.03, 0.0, 0.0]])
     normals = np.array([missing, [1.0, 0.0, 0.0], missing])
     fit = fit_contacts(model, points, normals)

@@ -225,7 +225,6 @@ def test_example_of_the_docs_decides(
         ("{}:Broken", "mine.py:Broken: must run, got ZeroDivisionError in line"),
         ("{}:Wordless", "mine.py:Wordless.*run must return a PostureVerdict, got True"),
         ("{}:Stranger", "Stranger: must be a subclass of MujocoProtocol"),
-        ("{}:Nobody", "must have a class Nobody, got none"),
         ("{}:Nameless", "Nameless: must have a name and a source, got none"),
         ("{}:Heavy", "weak: mass or density must be None, and only one of them, got 0.1 and 500.0"),
         ("lift", "must be one that runs in mujoco, got lift"),
@@ -311,11 +310,9 @@ def test_command_prints_a_line_per_file(hand: Path, assets: Path, write: Write) 
     ("options", "why"),
     [
         (["--protocol", "nobody"], "protocol must be one of lift"),
-        (["--protocol", "dexgraspbench", "--out", "a.h5"], "--out must be left out with protocol"),
         (["--protocol", "dexgraspbench"], "hand must be an MJCF"),
         (["--protocol", "dexgraspbench", "--units", "mm"], "--units must be left out with"),
         (["--protocol", "dexgraspbench", "--set", "seed=1"], "--set must be left out with"),
-        (["--assets", "."], "--assets must be used with another --protocol"),
     ],
 )
 def test_options_that_contradict_each_other(write: Write, options: list[str], why: str) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.arms import write_arm
 from helpers.objects import box_model
 
 from drakegrasp.frames import Array, invert_pose, make_pose, rotation_about, rotation_angle
@@ -22,11 +21,6 @@ from drakegrasp.reach.reaching import Grasp, approach_path, lift_path, reach_gra
 #: Height of the box [m].
 HEIGHT = 0.1
 BASE = (-0.5, 0.0, 0.0, 0.3)
-
-
-@pytest.fixture(scope="module")
-def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_arm(tmp_path_factory.mktemp("arm"))
 
 
 @pytest.fixture(scope="module")
@@ -99,16 +93,6 @@ def test_six_joints_have_eight_branches(six: Path) -> None:
     use = np.abs((found - middle) / half).max(axis=1)
     assert (np.diff(use) >= 0.0).all()
     assert not len(find_branches(cell.chain, cell.limits, make_pose(np.eye(3), [9.0, 0.0, 0.0])))
-
-
-def test_the_jacobian_is_the_derivative_of_the_pose(six: Path) -> None:
-    cell, step = cell_of(six), 1e-6
-    (q,) = drawn(cell, 1)
-    X, J = flange_poses(cell.chain, q + step * np.concatenate([np.zeros((1, 6)), np.eye(6)]))
-    np.testing.assert_allclose((X[1:, :3, 3] - X[0, :3, 3]) / step, J[0, :3].T, atol=1e-5)
-    R = (X[1:, :3, :3] - X[0, :3, :3]) / step @ X[0, :3, :3].T
-    turning = np.stack([R[:, 2, 1], R[:, 0, 2], R[:, 1, 0]])
-    np.testing.assert_allclose(turning, J[0, 3:], atol=1e-5)
 
 
 def test_a_branch_is_followed_without_a_jump(six: Path) -> None:

@@ -7,18 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.arms import write_arm
 from helpers.commands import error_line, run
 
 import drakegrasp as dg
 from drakegrasp.exchange.attempts import read_attempts
 
 GRASP = [-0.025, 0.03, -0.009, 0.025, 0.03, -0.009, 0, -0.03, -0.009, 0, 1, 0, 0, 1, 0, 0, -1, 0]
-
-
-@pytest.fixture(scope="module")
-def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_arm(tmp_path_factory.mktemp("arm"))
 
 
 @pytest.mark.sim

@@ -5,24 +5,24 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import pytest
 from helpers.datasets import make_dataset
 
-from drakegrasp.api.building import make_benchmark
-from drakegrasp.dataset.manifest import (
-    Manifest,
-    RefusedMesh,
-    installed_versions,
-    write_manifest,
-)
+from drakegrasp.api import building
+from drakegrasp.api.building import make_benchmark, make_clutter_benchmark
+from drakegrasp.dataset.manifest import Manifest, RefusedMesh, installed_versions, write_manifest
 from drakegrasp.dataset.paths import BENCHMARK_FILE, BUILTIN_FOLDER, DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.scoring import benchmark
+from drakegrasp.runtime.files import seal
+from drakegrasp.scoring import benchmark, clutter_benchmark
 from drakegrasp.scoring.benchmark import (
     FRICTIONS,
     MASSES,
@@ -35,6 +35,7 @@ from drakegrasp.scoring.benchmark import (
     rows_digest,
     write_objects,
 )
+from drakegrasp.scoring.clutter_benchmark import facts_of
 from drakegrasp.shapes.catalog import CLASSES, draw_builtin
 
 CONFIG = load_config(PRESET)
@@ -172,3 +173,42 @@ def test_a_card_says_whether_all_rows_are_the_published_ones(tmp_path, monkeypat
         assert found is not None
         assert (found["rows"], found["rows_as_published"]) == (len(test), same)
         assert found["published_rows"] == rows["count"]
+
+
+# The frozen scenes
+
+
+@pytest.mark.parametrize(
+    ("place", "by"), [("scenes/X_TO", 1e-6), ("grasps/outcome", 1), ("grasps/X_TG", 0.5)]
+)
+def test_objects_poses_and_labels_identify_scenes(small_clutter, tmp_path, place, by):
+    path = Path(shutil.copy(small_clutter / "clutter.hdf5", tmp_path))
+    known = facts_of(path)
+    assert known == facts_of(small_clutter / "clutter.hdf5")
+    with h5py.File(path, "r+") as file:
+        file[place][0] += by
+    seal(path)
+    assert facts_of(path).sha256 != known.sha256
+
+
+def test_recipe_is_made_and_compared(small_clutter, monkeypatch):
+    """By the public functions, with one client."""
+    asked = []
+    monkeypatch.setattr(building, "joined", lambda client, workers: nullcontext())
+    monkeypatch.setattr(building, "build_dataset", lambda *a, **k: asked.append((a, k)))
+    monkeypatch.setattr(building, "build_clutter", lambda *a, **k: asked.append((a, k)))
+    found, same = make_clutter_benchmark(small_clutter, show=False)
+    assert not same and found == facts_of(small_clutter / "clutter.hdf5")
+    (objects, first), (out, second) = asked
+    assert objects == ("builtin", small_clutter) and out == (small_clutter,)
+    assert first["config"] == load_config(clutter_benchmark.PRESET)
+    assert {"scenes": 60, "objects": (2, 6), "tries": 10}.items() <= second.items()
+    assert second["surroundings"] == ("table", "bin", "shelf")
+    monkeypatch.setattr(clutter_benchmark, "published", lambda: found)
+    assert make_clutter_benchmark(small_clutter, show=False)[1]
+
+
+def test_published_scenes_have_sixty():
+    scenes = clutter_benchmark.published()
+    assert scenes.scenes == 60 and len(scenes.sha256) == 64
+    assert replace(scenes, grasps=0) != scenes

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
 from helpers.depth_images import X_TC, K, box_view, cloud_of
 
 import drakegrasp as dg
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.clutter import load_scene
+from drakegrasp.dataset.scenes import SceneDataset, SceneRows
+from drakegrasp.frames import unpack_pose
+from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.scoring import ranking
-from drakegrasp.scoring.predicting import _predict_view, _SceneView, predict
+from drakegrasp.scoring.predicting import _predict_view, _SceneView, predict, predict_scenes
+from drakegrasp.scoring.ranking import seen_neighbours
 from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.verification.placing import dataset_config, place_on_rows
+from drakegrasp.vision.depth_image import View
 
 CONFIG = dg.load_config("fast", ["objects.mass=0.3"])
 
@@ -119,3 +130,76 @@ def test_a_view_without_its_object_is_told_from_a_bad_one(view):
     for changes in ({"mask": view.mask[1:]}, {"K": 2 * K}, {"depth": depth}, {"X_TC": lower}):
         with pytest.raises(dg.GraspError, match="view of box"):
             predicted(**changes)
+
+
+# Scenes of several objects: the mask chooses one, the others count
+
+
+@pytest.fixture(scope="module")
+def rows(small_clutter: Path) -> SceneRows:
+    return SceneRows(small_clutter / "clutter.hdf5", split="test")
+
+
+@pytest.fixture(scope="module")
+def first(rows: SceneRows) -> tuple[View, np.ndarray]:
+    """What the first row shows of its object, and a mask of all objects."""
+    data, view = SceneDataset(rows.path, points=None, split="test"), rows.views[0]
+    seen, X_TC = data.images(int(view)), unpack_pose(data.tables["views"]["X_TC"][view])
+    return View(seen["depth"], rows.value("masks", 0), seen["K"], X_TC), seen["mask"]
+
+
+@pytest.mark.sim
+def test_grasps_are_for_the_objects_of_the_rows(rows: SceneRows) -> None:
+    found, blind = predict_scenes(rows.path, count=2)
+    assert blind == 0 and set(found.of_row) == set(range(len(rows)))
+    names = rows.column("object_props/object_name")
+    assert list(found.objects) == names[found.of_row].tolist()
+    # Palms are near their object, and can be tried there.
+    placed = place_on_rows(found, rows, config=dataset_config(rows))
+    for each in placed:
+        assert not each.invalid and each.placed.around is not None
+        assert np.linalg.norm(each.postures[0].X_OG[:3, 3]) < 0.25
+    X_TO = np.array([each.placed.X_TO for each in sorted(placed, key=lambda each: each.index)])
+    scene = load_scene(rows.path, int(rows.scenes[0]))
+    np.testing.assert_array_equal(X_TO[0], scene.X_TO[rows.places[0]])
+    assert multiply(X_TO, found.X_FG)[:, 2, 3].min() > 0.0
+
+
+@pytest.mark.sim
+def test_the_others_are_completed_from_the_view(
+    rows: SceneRows, first: tuple[View, np.ndarray]
+) -> None:
+    boxes = load_surroundings("bin").boxes
+    around = seen_neighbours(*first, boxes, dataset_config(rows))
+    (model,), (X_TN,) = around.models, around.X_TN
+    assert around.boxes == boxes
+    due = load_scene(rows.path, int(rows.scenes[0])).X_TO[1 - int(rows.places[0])]
+    assert np.linalg.norm(X_TN[:3, 3] - due[:3, 3]) < 0.03
+    assert 0.04 < 2.0 * model.half_extents.max() < 0.2
+
+
+@pytest.mark.sim
+def test_a_neighbour_in_the_way_counts_if_grasps_are_lifted(
+    rows: SceneRows, first: tuple[View, np.ndarray]
+) -> None:
+    """The same neighbour far away and where the best palm is."""
+    (own, mask), config = first, dataset_config(rows)
+    cloud = dg.cloud_from_depth(own.depth, own.K, own.mask, own.X_TC)
+    around = seen_neighbours(own, mask, (), config)
+    proposed = dg.propose(cloud)
+    best = int(dg.rank(proposed, cloud, config=config).order[0])
+    one = proposed.at([best])
+    X_TN = around.X_TN.copy()
+    X_TN[0, :3, 3] = one.X_FG[0, :3, 3]
+    far = around.X_TN.copy()
+    far[0, :2, 3] += 1.0
+    for X, share in ((far, 1.0), (X_TN, 0.0)):
+        there = type(around)(models=around.models, X_TN=X)
+        found = dg.rank(one, cloud, simulate=1, view=own, config=config, around=there)
+        assert (found.share[0] > 0.0) == (share > 0.0)
+
+
+@pytest.mark.sim
+def test_arms_are_refused(rows: SceneRows) -> None:
+    with pytest.raises(dg.ConfigError, match=r"arm must be None for scenes of .*, got x"):
+        predict_scenes(rows.path, arm=SimpleNamespace(name="x"))  # type: ignore[arg-type]

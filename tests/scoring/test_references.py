@@ -22,19 +22,6 @@ def inputs(data):
     )
 
 
-#: Those that are grasps of contacts.
-CONTACTS = [name for name in REFERENCES if name != "closing"]
-
-
-@pytest.mark.parametrize("name", CONTACTS)
-def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(inputs, name):
-    grasps = REFERENCES[name].make(inputs)
-    assert grasps.shape == (len(inputs.rows), 18)
-    lengths = np.linalg.norm(grasps[:, 9:].reshape(-1, 3, 3), axis=-1)
-    np.testing.assert_allclose(lengths, 1.0, atol=1e-6)
-    np.testing.assert_array_equal(REFERENCES[name].make(inputs), grasps)
-
-
 def test_own_grasps_are_the_stored_ones(inputs):
     np.testing.assert_array_equal(references.own(inputs), inputs.data.column("grasps"))
 

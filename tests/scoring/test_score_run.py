@@ -192,26 +192,20 @@ def test_without_blind_rows_a_card_says_so(data):
 TRAINED_ON = "2 test objects also in training, by name"
 
 
-def test_objects_that_were_trained_on_are_a_warning(data):
-    card = scored(data, train=data).card
-    assert TRAINED_ON in card["warnings"]
-    other = scored(data).card
-    assert not any("also in training" in warning for warning in other["warnings"])
-
-
-def test_objects_of_equal_names_and_other_meshes_are_other_objects(data, tmp_path):
-    """As built-in objects of another seed are; a file alone says nothing of meshes."""
+def test_objects_that_were_trained_on_are_a_warning(data, tmp_path):
+    """Not those of equal names and other meshes; a file alone says nothing of meshes."""
+    assert TRAINED_ON in scored(data, train=data).card["warnings"]
+    assert not any("also in training" in warning for warning in scored(data).card["warnings"])
     out = tmp_path / "other"
     shutil.copytree(data.path.parent, out)
     manifest = read_manifest(out)
     changed = tuple(replace(each, mesh_sha256="0" * 64) for each in manifest.objects)
     write_manifest(replace(manifest, objects=changed), out)
     train = GraspDataset(out / OTO, split="test")
-    card = scored(data, train=train).card
-    assert not any("also in training" in warning for warning in card["warnings"])
+    warnings = scored(data, train=train).card["warnings"]
+    assert not any("also in training" in warning for warning in warnings)
     (out / "manifest.json").unlink()
-    card = scored(data, train=train).card
-    assert TRAINED_ON in card["warnings"]
+    assert TRAINED_ON in scored(data, train=train).card["warnings"]
 
 
 def test_files_of_a_card_are_whole_and_come_again(data, tmp_path):

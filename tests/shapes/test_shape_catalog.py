@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -111,21 +109,6 @@ def test_draws_fill_their_range_in_whole_steps() -> None:
     assert [str(span) for span in spans] == ["4.5 to 6 mm", "90 to 100 deg", "8 to 11"]
 
 
-def test_a_draw_depends_on_class_index_and_seed_alone() -> None:
-    """The sizes are stated here: they must never change for a name and a seed."""
-    sizes = builtin_object("1_mug_1").sizes
-    assert sizes == {
-        "radius": 0.0407,
-        "height": 0.0988,
-        "handle_reach": 0.0274,
-        "handle_radius": 0.0062,
-    }
-    assert sizes != builtin_object("1_mug_2").sizes
-    assert sizes != builtin_object("1_mug_1", seed=1).sizes
-    both = draw_builtin(BuiltinConfig(per_class=3))[0], draw_builtin(BuiltinConfig())[0]
-    assert both[0].sizes == both[1].sizes == sizes
-
-
 def test_as_many_of_each_class_as_asked_for() -> None:
     assert [item.number for item in CLASSES] == list(range(1, 65))
     drawn = draw_builtin(BuiltinConfig(per_class=3, seed=5))
@@ -148,19 +131,6 @@ def test_export_round_trip(tmp_path: Path) -> None:
         loaded, built = trimesh.load_mesh(path, process=False), builtin_object(name).build()
         np.testing.assert_allclose(loaded.vertices, built.vertices, atol=1e-12)
         np.testing.assert_array_equal(loaded.faces, built.faces)
-
-
-@pytest.mark.nightly
-def test_another_process_writes_the_same_bytes(tmp_path: Path) -> None:
-    here = export_builtin(tmp_path / "here", SOME)
-    script = (
-        "import sys; from drakegrasp.shapes.catalog import export_builtin; "
-        "export_builtin(sys.argv[1], sys.argv[2:])"
-    )
-    command = [sys.executable, "-c", script, str(tmp_path / "there"), *SOME]
-    subprocess.run(command, check=True, timeout=120)
-    for path in here:
-        assert path.read_bytes() == (tmp_path / "there" / path.name).read_bytes()
 
 
 def test_sources_are_the_objects_of_a_configuration_alone(

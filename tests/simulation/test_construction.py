@@ -269,12 +269,3 @@ def test_coupled_joints_are_where_the_hand_file_has_them(shipped: Scene) -> None
         for coupling in finger.coupled:
             expected = coupling.ratio * q[finger.closing_joint] + coupling.offset
             assert q[coupling.joint] == pytest.approx(expected, abs=2e-3), coupling.joint
-
-
-def test_limits_of_closing_joints_are_the_models(shipped: Scene) -> None:
-    """They are what a drive gives back, and what an empty hand closes up to."""
-    hand = shipped.hand
-    for joint, limits in zip(shipped.closing_joints, shipped.closing_limits, strict=True):
-        described = hand.joint_limits[hand.joint_names.index(joint.name())]
-        assert limits == pytest.approx(described)
-        assert joint.position_lower_limits()[0] == limits[0] < limits[1]

@@ -69,28 +69,16 @@ def test_materials_of_an_attempt_are_those_of_a_scene_built_with_them(
     )
     assert_same_bits(found, built)
     assert frictions(scene) == coefficients
+    # Nothing of them remains.
+    fresh = build_scene(cube, config.physics, hand)
+    first, again = (run_attempt(s, standing(cube), plain, config) for s in (fresh, scene))
+    assert_same_bits(again, first)
 
 
-def test_nothing_remains_of_the_materials_of_the_attempt_before(
-    scene: Scene, cube: ObjectModel, config: Config
-) -> None:
-    plain, X_TO = from_above(cube, STANDOFF), standing(cube)
-    first = run_attempt(scene, X_TO, plain, config)
-    other = attempt_with(cube, config, friction_hand=0.4, friction_table=0.3, mass=1.3)
-    changed = run_attempt(scene, X_TO, other, config)
-    assert changed.lift.slip != first.lift.slip
-    assert_same_bits(run_attempt(scene, X_TO, plain, config), first)
-
-
-def test_copy_of_an_object_shares_its_scene(cube: ObjectModel, config: Config) -> None:
-    scene = cached_scene(cube, config.physics, config.hand)
+def test_scene_is_that_of_equal_objects_and_physics(cube: ObjectModel, config: Config) -> None:
     copy = replace(cube, collision_vertices=cube.collision_vertices.copy())
+    scene = cached_scene(cube, config.physics, config.hand)
     assert cached_scene(copy, config.physics, config.hand) is scene
-
-
-def test_scene_of_another_mass_shape_or_physics_is_another(
-    cube: ObjectModel, config: Config
-) -> None:
     large = replace(cube, collision_vertices=1.1 * cube.collision_vertices)
     slick = config.physics.model_copy(update={"friction_hand": 0.1})
     for model, physics in (

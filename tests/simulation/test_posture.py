@@ -33,29 +33,9 @@ def posture_of(hand, spread: float, closing: list[float], **other: np.ndarray) -
     return Posture(X, np.array([named[name] for name in hand.joint_order]), **other)
 
 
-@pytest.mark.parametrize("frame", ["object", "table", "camera", "world"])
-def test_pose_in_any_frame_is_held_in_the_object(frame):
-    hand = load_hand()
-    X_TO, X_TC = make_pose(np.eye(3), [0.0, 0.0, 0.05]) @ X, X @ X
-    in_table = {"object": X_TO, "table": np.eye(4), "camera": X_TC, "world": np.linalg.inv(X_WT)}
-    X_FG = np.linalg.inv(in_table[frame]) @ X_TO @ X
-    camera = X_TC if frame == "camera" else None
-    made = make_posture(hand, X_FG, np.zeros(8), frame=frame, X_TO=X_TO, X_TC=camera)
-    np.testing.assert_allclose(made.X_OG, X, atol=1e-12)
-
-
-def test_joints_in_another_order_are_told_by_their_names():
-    hand = load_hand("allegro")
-    order, q = hand.joint_order, np.arange(16.0) / 100.0
-    made = make_posture(hand, X, q[::-1], q[::-1], joints=order[::-1])
-    np.testing.assert_array_equal(made.q_grasp, q)
-    np.testing.assert_array_equal(made.q_pregrasp, q)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"q_grasp": np.zeros(7)}, r"grasp joints must be of shape \(1, 8\), got \(1, 7\)"),
         ({"q_grasp": np.full(8, np.nan)}, "q_grasp must be finite numbers"),
         ({"q_squeeze": ["a"] * 8}, "squeeze joints must be numbers .*, got text"),
         ({"X_FG": np.zeros((4, 4))}, "the palm's pose must have 0 0 0 1"),
@@ -193,11 +173,9 @@ def test_worm_of_a_joint_holds_against_the_way_of_its_motor(scene, cube, given, 
 
 @pytest.mark.sim
 def test_public_trial_closes_the_fingers_of_the_preshape(cube, given, tmp_path):
-    path = write_with_preshapes(tmp_path, all="F1 F2 F3", pair="F1 F3")
-    config = load_config(overrides=[f"hand={path}"])
-    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
-    assert len(run_trial(placed, replace(given, preshape="all")).closed.contacts.touching) == 3
-    # The second finger stays open.
+    """The second finger stays open."""
+    path = write_with_preshapes(tmp_path, pair="F1 F3")
+    placed = PlacedObject(model=cube, X_TO=standing(cube), config=load_config(hand=str(path)))
     q, order = given.q_grasp.copy(), load_hand(path).joint_order
     q[[order.index(name) for name in ("finger2_proximal_joint", "finger2_distal_joint")]] = 0.0
     trial = run_trial(placed, replace(given, q_grasp=q, preshape="pair"))

@@ -154,54 +154,6 @@ def tip_distance(hand: Hand, finger: int, angle: float, attempt, wall: float) ->
     return float(np.abs(y - wall).min()) - 0.001
 
 
-# The sweep and the margins, against brute force
-
-
-def lookup_of(model: ObjectModel, attempts: list[Attempt]) -> stage.PointLookup:
-    X_OG = np.stack([attempt.X_OG for attempt in attempts])
-    return stage.PointLookup(model.field, standing(model), X_OG)
-
-
-def brute_sweep(lookup, path, row: int, config: ScreenConfig) -> tuple[int, bool, int]:
-    """Return start, whether the pad arrives, and the last angle, looking at every angle."""
-    rows, end = np.array([row]), len(path.angles) - 1
-    start, starting, arrives, last = 0, True, False, end
-    for k in range(end + 1):
-        points = path.points[k][None]
-        to_object = lookup.distances(rows, points, config.clearance)
-        least = min(to_object.min(), lookup.heights(rows, points).min())
-        starting &= bool(least > np.float32(config.clearance))
-        start = k if starting else start
-        if to_object[0, : path.pad].min() <= np.float32(config.reach_margin):
-            arrives, last = True, k
-        if least < -np.float32(config.block_margin):
-            break
-    return start, arrives, last
-
-
-@pytest.mark.parametrize(
-    "config",
-    [ScreenConfig(), ScreenConfig(clearance=0.0055, reach_margin=0.004, block_margin=0.002)],
-    ids=["usual", "other"],
-)
-def test_sweep_finds_what_a_look_at_every_angle_finds(cube, hand, config):
-    """For each finger of attempts around the cube, some of which close on the table."""
-    attempts = [from_above(cube, standoff) for standoff in (0.035, 0.045, 0.06, 0.09, 0.13)]
-    aside = make_pose(np.eye(3), [0.03, 0.05, 0.0])
-    attempts += [replace(attempt, X_OG=aside @ attempt.X_OG) for attempt in attempts]
-    lookup, rows = lookup_of(cube, attempts), np.arange(len(attempts))
-    kinds = set()
-    for path in hand_paths(hand, 0.0).fingers:
-        sweep = stage._sweep_finger(lookup, path, rows, config)
-        for row in rows:
-            start, arrives, last = brute_sweep(lookup, path, row, config)
-            assert sweep.start[row] == start
-            assert sweep.arrives[row] == arrives
-            assert not arrives or sweep.last[row] == last
-            kinds.add((start > 0, arrives))
-    assert {(True, True), (True, False)} <= kinds
-
-
 def test_fingers_start_before_they_may_cross_in_an_attempt(cube, hand):
     """In the air, with margins so wide that it is simulated: they start well before their ends."""
     attempt = from_above(cube, 0.25)

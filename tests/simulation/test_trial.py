@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,18 +21,18 @@ from helpers.objects import (
     standing,
 )
 
-from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
-from drakegrasp.hand.file_format import PAD_BAND
+from drakegrasp.frames import X_WT, make_pose, transform_points
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation import scene as stepping
+from drakegrasp.simulation import trial as trial_module
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.construction import build_object_scene, build_scene
-from drakegrasp.simulation.contacts import is_inside
+from drakegrasp.simulation.contacts import ClearanceMonitor, is_inside
 from drakegrasp.simulation.lift import lift_duration
-from drakegrasp.simulation.scene import advance, reset_attempt, reset_object
+from drakegrasp.simulation.scene import Scene, advance, reset_object
 from drakegrasp.simulation.screen import Screening
 from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 
@@ -284,30 +286,13 @@ def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand):
 # Each verdict of a trial, by the one contact that decides it
 
 
-def test_hand_that_presses_beside_a_pad_does_not_lift(scene, cube, config, held):
-    """The patch of the first fingertip lies mostly beside a pad with its band."""
-    tip = scene.fingertips[0]
-    reset_attempt(
-        scene,
-        X_WT @ standing(cube),
-        X_WT @ standing(cube) @ from_above(cube, STANDOFF).X_OG,
-        spread=0.0,
-        closing=held.closed.q[[1, 4, 6]],
-    )
-    X_FO = invert_pose(scene.pose(tip)) @ scene.pose(scene.object)
-    x = float((X_FO[:3, :3] @ held.closed.contacts.p_OQ[0] + X_FO[:3, 3])[0])
-    begin = x + PAD_BAND + 1e-3
-    beyond = {"pad_region": ((1.0, 0.0, 0.0, begin),), "pad_point": (x + 0.01, 0.01, 0.0)}
-    first, *others = scene.hand.fingers
-    fingers = (replace(first, **beyond), *others)
-    other = replace(scene, hand=replace(scene.hand, fingers=fingers))
-    everything = override_config(config, ["screen.mode=off"])
-    attempt = from_above(cube, STANDOFF)
-    record = run_attempt(other, standing(cube), attempt, everything)
+def test_hand_whose_other_link_is_on_the_object_does_not_lift(scene, cube, config, monkeypatch):
+    """Which part of a patch is a link's: test_contacts.py."""
+    read = trial_module.read_contacts
+    monkeypatch.setattr(trial_module, "read_contacts", lambda s: replace(read(s), other_links=1))
+    record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
     assert record.closed.contacts.touching.all()
-    assert record.closed.contacts.other_links == 1
-    assert record.outcome is Outcome.HAND_CONTACT
-    assert record.lift is None
+    assert (record.outcome, record.lift) == (Outcome.HAND_CONTACT, None)
 
 
 def test_slip_and_turn_are_how_the_object_lags_behind_the_palm(cube, config, hand):
@@ -392,3 +377,86 @@ def test_limit_is_of_the_threads_own_computing_time(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(stepping, "time", SimpleNamespace(thread_time=lambda: 5.0, **others))
     limits = stepping.start_limits(load_config(overrides=["attempt_seconds=3"]))
     assert limits.deadline == pytest.approx(8.0)
+
+
+# The least height of the hand above the table: by Drake's own poses after every step, and the
+# corners of its own hulls
+
+#: Stand-offs at which the tips pass 1 mm below the table's top and end above it, and 1 mm above.
+SCRAPES, PASSES = 0.042, 0.044
+
+
+@pytest.fixture
+def noted(scene: Scene) -> Iterator[list[tuple[float, float]]]:
+    """A list that gets the time [s] and the hand's least height [m] after each step.
+
+    With worms the lift would take the place of the recorder.
+    """
+    inspector, seen = scene.scene_graph.model_inspector(), list[tuple[float, float]]()
+    hulls = [
+        (body, inspector.GetPoseInFrame(geometry), inspector.GetConvexHull(geometry))
+        for body in scene.links
+        for geometry in scene.plant.GetCollisionGeometriesForBody(body)
+    ]
+
+    def note(root: Any) -> None:
+        context, lowest = scene.plant.GetMyContextFromRoot(root), np.inf
+        for body, X_BS, hull in hulls:
+            if hull is not None:  # boxes and cylinders are parts of the palm, above the fingertips
+                X_WS = scene.plant.EvalBodyPoseInWorld(context, body) @ X_BS
+                corners = [X_WS @ hull.vertex(i) for i in range(hull.num_vertices())]
+                lowest = min(lowest, np.array(corners)[:, 2].min())
+        seen.append((root.get_time(), lowest - X_WT[2, 3]))
+
+    scene.simulator.set_monitor(note)
+    yield seen
+    scene.simulator.clear_monitor()
+
+
+@pytest.mark.parametrize("standoff", [SCRAPES, PASSES])
+def test_clearance_is_the_least_of_all_steps(scene, cube, config, noted, standoff) -> None:
+    # The whole way from the open hand.
+    rules = override_config(config, ["screen.mode=off", "lift.drive=torque"])
+    record = run_attempt(scene, standing(cube), from_above(cube, standoff), rules)
+    closing = [height for time, height in noted if time <= record.closed.duration]
+    assert record.closed.clearance == pytest.approx(min(closing), abs=1e-4)
+    # What geometry skips counts.
+    quick = run_attempt(scene, standing(cube), from_above(cube, standoff), config)
+    assert quick.closed.clearance == pytest.approx(min(closing), abs=1e-4)
+
+
+def test_lift_begins_where_closing_ended(scene, cube, config, noted, monkeypatch) -> None:
+    looks = list[float]()
+
+    class Noted(ClearanceMonitor):
+        def look(self, scene: Scene) -> None:
+            looks.append(scene.time)
+            super().look(scene)
+
+    monkeypatch.setattr("drakegrasp.simulation.lift.ClearanceMonitor", Noted)
+    rules = override_config(config, ["lift.drive=torque"])
+    record = run_attempt(scene, standing(cube), from_above(cube, PASSES), rules)
+    assert looks[0] == pytest.approx(record.closed.duration)
+    lifting = [height for time, height in noted if time >= record.closed.duration - 1e-9]
+    assert record.lift.clearance == pytest.approx(min(lifting), abs=1e-4)
+    assert record.lift.clearance > record.closed.clearance + 1e-3
+
+
+def test_hand_that_scrapes_the_table_on_its_way_is_refused(scene, cube, config) -> None:
+    """It ends clear of the table, so that only the way says so; measuring changes nothing."""
+    attempt = from_above(cube, SCRAPES)
+    record = run_attempt(scene, standing(cube), attempt, config)
+    assert record.closed.contacts.touching.all()
+    assert not record.closed.contacts.hand_on_table
+    assert record.closed.clearance < -config.close.scrape_depth
+    assert (record.outcome, record.lift) == (Outcome.TABLE_CONTACT, None)
+
+    before = override_config(config, ["close.scrape_depth=null"])
+    lifted = run_attempt(scene, standing(cube), attempt, before)
+    assert lifted.outcome is Outcome.SUCCESS
+    assert np.isnan(lifted.closed.clearance)
+    deeper = override_config(config, ["close.scrape_depth=0.002"])
+    allowed = run_attempt(scene, standing(cube), attempt, deeper)
+    for stage in ("closed", "lift"):
+        one, other = (getattr(r, stage).contacts for r in (allowed, lifted))
+        assert pickle.dumps(one) == pickle.dumps(other)

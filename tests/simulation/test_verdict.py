@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from helpers.verdicts import some_contacts, some_trial
 
 from drakegrasp.config import CloseConfig
 from drakegrasp.hand.settings import load_config
@@ -44,30 +41,6 @@ ALL, ONE_OFF, NONE = [True, True, True], [True, False, True], [False, False, Fal
 def test_first_rule_that_applies_decides(judge, touching, other_links, on_table, outcome) -> None:
     """Only fingertips may touch what a closed hand lifts; all hold it in the end, off the table."""
     assert judge(touching, other_links, on_table) is outcome
-
-
-@pytest.mark.parametrize(
-    ("outcome", "other_links", "slip", "turn_deg", "precision", "stable"),
-    [
-        (Outcome.SUCCESS, 0, 0.0, 0.0, True, True),
-        (Outcome.SUCCESS, 0, 4.9e-3, 4.9, True, True),
-        # The limits themselves are beyond.
-        (Outcome.SUCCESS, 0, 5e-3, 0.0, True, False),
-        (Outcome.SUCCESS, 0, 0.0, 5.0, True, False),
-        # On the palm nothing is stable.
-        (Outcome.SUCCESS, 1, 0.0, 0.0, False, False),
-        (Outcome.SLIPPED, 0, 0.0, 0.0, False, False),
-    ],
-)
-def test_stable_is_a_precision_grasp_that_stays(
-    outcome, other_links, slip, turn_deg, precision, stable
-) -> None:
-    lifted = some_contacts(other_links=other_links)
-    motion = {"outcome": outcome, "slip": slip, "turn": np.deg2rad(turn_deg)}
-    trial = some_trial(np.eye(4), some_contacts(), lifted, **motion)
-    assert (trial.precision, trial.stable) == (precision, stable)
-    # Before the lift there is no motion.
-    assert not replace(trial, lift=None).stable
 
 
 @pytest.mark.parametrize(

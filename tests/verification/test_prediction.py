@@ -1,16 +1,18 @@
-"""What may be handed in to be verified: rows that are no grasp say why, and equal frames."""
+"""What may be handed in to be verified: rows that are no grasp say why, equal frames, and files."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
-import numpy.typing as npt
 import pytest
 from helpers.assertions import refused
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.frames import GRASP_FRAMES, X_WT, invert_pose, make_pose, pack_pose, read_pose
+from drakegrasp.errors import GraspError
+from drakegrasp.exchange.columns import read_contacts, read_numbers
+from drakegrasp.frames import GRASP_FRAMES, X_WT, invert_pose, make_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.placing import contacts_on_object
@@ -134,37 +136,26 @@ def placed_at(X_TO, X_OM):
     return PlacedObject(model=model, X_TO=X_TO)
 
 
-@pytest.mark.parametrize("single", [False, True], ids=["float64", "float32 rows"])
-@pytest.mark.parametrize("cameras", [1, 4], ids=["one camera", "one per grasp"])
-def test_the_frames_agree(single, cameras):
-    X_TO, X_OM, *X_TC = (random_pose(seed) for seed in range(1, 3 + cameras))
+@pytest.mark.parametrize("cameras", [1, 4])
+def test_the_frames_agree(cameras):
+    X_TO, X_OM, *poses = (random_pose(seed) for seed in range(1, 3 + cameras))
     grasps_O = np.array([one_grasp(i) for i in range(4)])
-    given: npt.ArrayLike = X_TC[0] if cameras == 1 else np.array(X_TC)
-    if single:
-        given = pack_pose(given).astype(np.float32)
-    X = read_pose(given, "X_TC")
-    # The poses that were handed in, after rounding, are the true ones.
-    each = np.broadcast_to(X, (4, 4, 4))
-    grasps = {
-        "object": grasps_O,
-        "table": np.array([transform_grasp(X_TO, g) for g in grasps_O]),
-        "world": np.array([transform_grasp(X_WT @ X_TO, g) for g in grasps_O]),
-        "mesh": np.array([transform_grasp(invert_pose(X_OM), g) for g in grasps_O]),
-        "camera": np.array(
-            [transform_grasp(invert_pose(C) @ X_TO, g) for C, g in zip(each, grasps_O, strict=True)]
-        ),
+    X_TC = poses[0] if cameras == 1 else np.array(poses)
+    to_frame = {
+        "object": np.eye(4),
+        "table": X_TO,
+        "world": X_WT @ X_TO,
+        "mesh": invert_pose(X_OM),
+        "camera": invert_pose(X_TC) @ X_TO,
     }
-    assert set(grasps) == set(GRASP_FRAMES)
-    placed = placed_at(X_TO, X_OM)
-    for frame, values in grasps.items():
-        where = {"X_TC": X} if frame == "camera" else {}
-        for grasp, due in zip(
-            contacts_on_object(values, placed, frame=frame, **where), grasps_O, strict=True
-        ):
-            found = pack_grasp(*grasp.in_object_frame())
-            np.testing.assert_allclose(found, due, atol=1e-12)
-    if single:
-        np.testing.assert_allclose(X, np.squeeze(X_TC), atol=1e-6)
+    assert set(to_frame) == set(GRASP_FRAMES)
+    for frame, X in to_frame.items():
+        each = zip(np.broadcast_to(X, (4, 4, 4)), grasps_O, strict=True)
+        given = [transform_grasp(*pair) for pair in each]
+        where = {"X_TC": X_TC} if frame == "camera" else {}
+        found = contacts_on_object(given, placed_at(X_TO, X_OM), frame=frame, **where)
+        packed = [pack_grasp(*grasp.in_object_frame()) for grasp in found]
+        np.testing.assert_allclose(packed, grasps_O, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -188,3 +179,100 @@ def test_a_frame_out_of_place_is_refused(frame, X, message):
     placed = placed_at(np.eye(4), np.eye(4))
     text = refused(contacts_on_object, np.ones((2, 18)), placed, frame=frame, X_TC=X)
     assert text.startswith(message)
+
+
+# Files
+
+NUMBERS = np.random.default_rng(0).normal(size=(4, 18)).round(6)
+
+
+def write(path, content):
+    """Write bytes, an array, or the arrays of an HDF5 file by their names."""
+    if isinstance(content, dict):
+        with h5py.File(path, "w") as file:
+            for name, values in content.items():
+                file[name] = values
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content)
+    return path
+
+
+IN_A_GROUP = {"a/grasps": NUMBERS, "a/rows": np.arange(4), "losses/valid": np.zeros(3)}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("grasps.npy", NUMBERS),
+        ("grasps.npy", NUMBERS.astype(np.float32)),
+        ("grasps.h5", {"grasps": NUMBERS}),
+        ("GRASPS.HDF5", IN_A_GROUP),
+    ],
+)
+def test_every_format_gives_the_same_numbers(tmp_path, name, content):
+    found = read_contacts(write(tmp_path / name, content))
+    np.testing.assert_allclose(found["grasps"], NUMBERS, atol=1e-6)
+    assert found["grasps"].dtype == np.float64
+    assert (found["rows"] is not None) == (content is IN_A_GROUP)
+
+
+def test_one_grasp_may_be_a_vector(tmp_path):
+    found = read_contacts(write(tmp_path / "one.npy", NUMBERS[0]))
+    assert np.array_equal(found["grasps"], NUMBERS[:1])
+
+
+@pytest.fixture
+def splits(tmp_path):
+    arrays = {"test/grasps": NUMBERS[:1], "test/rows": [5], "valid/grasps": NUMBERS[1:]}
+    return write(tmp_path / "splits.h5", arrays)
+
+
+def test_split_chooses_the_group(splits):
+    test, valid = (read_contacts(splits, split=name) for name in ("test", "valid"))
+    assert np.array_equal(test["grasps"], NUMBERS[:1])
+    assert test["rows"].tolist() == [5]
+    assert np.array_equal(valid["grasps"], NUMBERS[1:])
+    assert valid["rows"] is None
+
+
+def test_group_that_was_not_asked_for_is_never_taken(splits, tmp_path):
+    with pytest.raises(GraspError, match=r"in /train or at the root, got them in /test, /valid"):
+        read_contacts(splits, split="train")
+    with pytest.raises(GraspError, match=r"root or in one group, got .*; choose with --split"):
+        read_contacts(splits)
+    valid = write(tmp_path / "valid.h5", {"valid/grasps": NUMBERS})
+    with pytest.raises(GraspError, match="got them in /valid; choose with --split"):
+        read_contacts(valid, split="test")
+
+
+def test_root_is_taken_for_any_split(tmp_path):
+    path = write(tmp_path / "grasps.h5", {"grasps": NUMBERS})
+    assert len(read_contacts(path, split="valid")["grasps"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.txt", b"1,2,3", r"must be a file \.npy, \.h5 or \.hdf5, got '\.txt'"),
+        ("a.npy", [[1j] * 18], "must hold real numbers, got complex numbers"),
+        ("a.npy", [[True] * 18], "must hold real numbers, got truth values"),
+        ("a.npy", np.zeros((2, 3, 6)), r"or one grasp, got an array of shape \(2, 3, 6\)"),
+        ("a.h5", {"images": np.zeros(3)}, "must hold an array 'grasps' .*, got none$"),
+        (
+            "a.h5",
+            {"grasps": NUMBERS, "rows": [0.0] * 4},
+            "/rows must hold .* number .*, got float64",
+        ),
+    ],
+)
+def test_bad_file_is_one_line(tmp_path, name, content, words):
+    with pytest.raises(GraspError, match=words) as raised:
+        read_contacts(write(tmp_path / name, content))
+    assert "\n" not in str(raised.value)
+
+
+def test_poses_are_read_as_they_are(tmp_path):
+    poses = write(tmp_path / "poses.npy", np.stack([np.eye(4)] * 3))
+    assert read_numbers(poses).shape == (3, 4, 4)

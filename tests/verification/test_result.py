@@ -53,8 +53,9 @@ TIPS_ALONE, ANOTHER = "no other link of the hand touches it", "another link touc
     [
         (0.2, 0.3, 0, True, f"{TIPS_ALONE}: a precision grasp, stable."),
         (4.9, 4.9, 0, True, f"{TIPS_ALONE}: a precision grasp, stable."),
-        (5.1, 0.3, 0, False, f"{TIPS_ALONE}: a precision grasp, not stable."),
-        (0.2, 5.1, 0, False, f"{TIPS_ALONE}: a precision grasp, not stable."),
+        # The limits themselves are beyond.
+        (5.0, 0.3, 0, False, f"{TIPS_ALONE}: a precision grasp, not stable."),
+        (0.2, 5.0, 0, False, f"{TIPS_ALONE}: a precision grasp, not stable."),
         (0.2, 0.3, 1, False, f"{ANOTHER}: no precision grasp, not stable."),
         (73.0, 98.0, 2, False, "2 other links touch it: no precision grasp, not stable."),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import permutations
 from typing import Any
@@ -22,7 +23,7 @@ from drakegrasp.simulation.attempts import make_attempts
 from drakegrasp.simulation.candidates import R_OG0
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification import verify as verifying
 from drakegrasp.verification.placing import place_on_object
 from drakegrasp.verification.verify import verify_placed
@@ -69,7 +70,7 @@ def held(cube, grasp):
     return verify(cube, *grasp)
 
 
-def test_a_grasp_that_held_is_found_again_and_holds(held):
+def test_a_grasp_that_held_is_found_again_and_holds(held, cube):
     assert held.matches and held.outcome is Outcome.SUCCESS
     assert held.fit is not None and held.fit.residual.max() < 0.003
     assert np.rad2deg(held.fit.normal_error).max() < 15.0
@@ -78,15 +79,10 @@ def test_a_grasp_that_held_is_found_again_and_holds(held):
     assert held.epsilon > 0.0
     assert held.explain().startswith("The grasp of 1_cube_a holds")
     assert {"surface", "fit", "simulate"} <= set(held.seconds)
-
-
-def test_the_same_grasp_gives_the_same_bits(held, cube, grasp):
-    p, n = grasp
-    verify(cube, p + np.array([0.0, 0.0, 0.003]), n)  # something else in between
-    again = verify(cube, p, n)
-    np.testing.assert_array_equal(again.trial.X_OG, held.trial.X_OG)
-    np.testing.assert_array_equal(reached(again), reached(held))
-    np.testing.assert_array_equal(again.trial.lift.X_TO, held.trial.lift.X_TO)
+    assert held.placed is cube and held.precision and held.stable and held.kept
+    # The fingers were opened before they closed.
+    assert np.all(held.pregrasp.closing < held.fit.closing)
+    assert (X_WT @ cube.X_TO @ held.pregrasp.X_OG)[2, 3] > 0.65
 
 
 @pytest.mark.parametrize("where", ["table", "camera"])
@@ -143,11 +139,8 @@ def test_start_collision_names_the_links_and_what_they_are_in(cube, grasp):
     p, n = grasp
     found = verify(cube, p[[1, 0, 2]], n[[1, 0, 2]])
     assert found.outcome is Outcome.START_COLLISION and found.reason in found.explain()
-    scene = build_scene(cube.model, CONFIG.physics, HAND)
-    met = start_meetings(scene, cube.X_TO_simulated, found.pregrasp)
-    assert list(met) == ["object", "table"]
-    said = [f"{', '.join(links)} in the {other}" for other, links in met.items()]
-    assert found.reason == f"{found.outcome.text}: {'; '.join(said)}"
+    met = "finger1_distal, .* in the object; .* in the table"
+    assert re.fullmatch(f"{found.outcome.text}: {met}", found.reason)
 
 
 @pytest.mark.parametrize(
@@ -309,13 +302,6 @@ def test_wrist_poses_are_fitted_by_one_thread(cube, grasp, monkeypatch):
 
 def _fail(scene):
     raise RuntimeError("broken")
-
-
-def test_results_know_what_they_were_asked(held, cube):
-    assert held.placed is cube and held.precision and held.stable and held.kept
-    # The fingers were opened before they closed.
-    assert np.all(held.pregrasp.closing < held.fit.closing)
-    assert (X_WT @ cube.X_TO @ held.pregrasp.X_OG)[2, 3] > 0.65
 
 
 def test_verdict_is_that_of_a_whole_lift(held, cube, grasp):

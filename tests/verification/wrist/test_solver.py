@@ -12,19 +12,12 @@ from helpers.hands import SLIDER, write_pincer, write_slider
 from helpers.tiers import few
 from scipy.spatial.transform import Rotation
 
-import drakegrasp.verification.wrist_solver
-from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
+from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.verification.wrist_problem import hand_constants, nearest_on_pads, signed_distance
-from drakegrasp.verification.wrist_solver import (
-    DIFFERENT,
-    LEVER,
-    find_starts,
-    fit_wrist,
-    make_postures,
-)
+from drakegrasp.verification.wrist_solver import fit_wrist, make_postures
 
 SEEDS = range(25)
 #: Of the table's normal; above the table by so much that it never matters [m].
@@ -162,18 +155,6 @@ def test_a_fit_is_as_good_as_it_says_within_the_limits_of_the_joints(pincer, see
             assert np.linalg.det(R) > 0.0
 
 
-@pytest.mark.parametrize("seed", few(SEEDS[:8]))
-def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed):
-    """Fingers 1 and 2 are mirror images in the palm's plane x = 0, finger 3 is its own."""
-    hand, made = hand_of("barrett"), touched("barrett", seed)
-    mirror, swapped = np.diag([-1.0, 1.0, 1.0]), [1, 0, 2]
-    best = fit(hand, made)[0]
-    image = fit(hand, [each[swapped] @ mirror for each in made])[0]
-    assert image.objective == pytest.approx(best.objective, rel=1e-2)
-    np.testing.assert_allclose(image.closing, best.closing[swapped], atol=1e-3)
-    assert image.spread == pytest.approx(best.spread, abs=1e-3)
-
-
 def test_a_table_in_the_way_pushes_the_hand_up():
     """At most a millimetre or two of the rounding and of the last closing step are below."""
     hand, pushed = hand_of("barrett"), 0
@@ -205,33 +186,15 @@ def test_each_finger_is_moved_onto_its_point():
         assert np.abs(distance).max() < 1e-7, distance
 
 
-def test_contacts_out_of_reach_leave_a_large_residual():
+def test_nonsense_that_a_network_may_predict_is_no_crash():
+    """Contacts out of reach leave a large residual; then all in one point."""
     angle = 2.0 * np.pi * np.arange(3) / 3.0
     outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
     p_OQ = 0.5 / np.sqrt(3.0) * outward  # an equilateral triangle with edges of 0.5 m
-    for each in fit(hand_of("barrett"), (p_OQ, outward)):
-        assert each.residual.max() > 0.05
-        assert np.isfinite(each.X_OG).all()
-
-
-def test_contacts_in_one_point_are_no_crash():
-    """Nonsense that a network may well predict."""
-    for normals in (np.tile(UP, (3, 1)), np.eye(3)):
-        for each in fit(hand_of("barrett"), (np.zeros((3, 3)), normals)):
+    for made in ((p_OQ, outward), (0.0 * p_OQ, np.tile(UP, (3, 1))), (0.0 * p_OQ, np.eye(3))):
+        for each in fit(hand_of("barrett"), made):
             assert np.isfinite(each.X_OG).all() and np.isfinite(each.objective)
-
-
-# Where to start
-
-
-@pytest.mark.parametrize("row", [0, 1234, 9000, -1])
-def test_a_posture_of_the_table_is_its_own_first_start(row):
-    postures, rng = make_postures(hand_of("barrett")), np.random.default_rng(row + 1)
-    X_OG = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
-    p_OQ = transform_points(X_OG, postures.p_GP[row])
-    found, c = find_starts(postures, p_OQ, -rotate_vectors(X_OG, postures.n_G[row]), 3)[0]
-    np.testing.assert_array_equal(c, postures.coordinates[row])
-    np.testing.assert_allclose(found, X_OG, atol=1e-9)
+            assert each.residual.max() > 0.05 or not made[0].any()
 
 
 def test_fingers_that_slide_far_have_postures_for_195_mm(tmp_path):
@@ -239,26 +202,6 @@ def test_fingers_that_slide_far_have_postures_for_195_mm(tmp_path):
     far = write_slider(tmp_path, SLIDER.replace('upper="0.04"', 'upper="0.5"'))
     slid = make_postures(load_hand(far)).coordinates[:, 1:]
     assert 0.18 < slid.max() <= 0.1 * np.deg2rad(112.0)
-
-
-def misfit(name, X_OG, c, made):
-    """Return what is left between a posture's contacts, as arrows of length `LEVER`, and others."""
-    hand, constants = hand_of(name), hand_constants(hand_of(name))
-    X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=hand.closing_ratio @ c[1:])
-    contact = signed_distance(constants.pads, constants.pad_points)
-    on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
-    p, n = moved(X_OF, on_pad) - made.p_OQ, turned(X_OF, contact.normal) + made.nhat_Q_O
-    return float(np.sum(p**2) + np.sum((p + LEVER * n) ** 2))
-
-
-@pytest.mark.parametrize("seed", few(SEEDS[:8]))
-def test_search_by_shape_finds_what_laying_over_every_posture_finds(monkeypatch, seed):
-    postures, made = make_postures(hand_of("barrett")), touched("barrett", seed)
-    (quick,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
-    monkeypatch.setattr(drakegrasp.verification.wrist_solver, "NEAREST", len(postures.coordinates))
-    (best,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
-    least = misfit("barrett", *best, made)
-    assert misfit("barrett", *quick, made) < 1.2 * least
 
 
 def test_two_contacts_are_reached_from_all_around_their_line():
@@ -272,16 +215,3 @@ def test_two_contacts_are_reached_from_all_around_their_line():
     angles = np.sort(np.arctan2(directions[:, 2], directions[:, 0]))
     gaps = np.diff(np.r_[angles, angles[0] + 2.0 * np.pi])
     assert np.rad2deg(gaps.max()) < 15.0
-
-
-def test_starts_tell_left_from_right(monkeypatch):
-    """Mirrored contacts have the same lengths and angles; their posture must be another."""
-    monkeypatch.setattr(drakegrasp.verification.wrist_solver, "NEAREST", 1)
-    postures, mirror = make_postures(hand_of("barrett")), np.diag([-1.0, 1.0, 1.0])
-    wanted = np.deg2rad([33.75, 32.0, 88.0, 56.0])
-    row = int(np.abs(postures.coordinates - wanted).max(axis=1).argmin())
-    p, n = postures.p_GP[row], postures.n_G[row]
-    ((_, own),) = find_starts(postures, p, -n, 1)
-    ((_, image),) = find_starts(postures, p @ mirror, -n @ mirror, 1)
-    np.testing.assert_allclose(own, wanted, atol=1e-9)
-    assert np.abs(image - wanted).max() > DIFFERENT
