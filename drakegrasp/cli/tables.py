@@ -19,7 +19,6 @@ from drakegrasp.dataset.statistics import (
     SplitCount,
     count_clutter,
     count_funnel,
-    count_splits,
     lifted_note,
 )
 from drakegrasp.errors import DataError, counted, printable
@@ -150,7 +149,7 @@ def print_stats(out: Path) -> None:
     console, funnel = make_console(), count_funnel(out)
     console.print(funnel_table(funnel))
     console.print()
-    console.print(split_table(count_splits(out), read_manifest(out).config.split.by))
+    console.print(split_table(funnel.splits, read_manifest(out).config.split.by))
     if line := approach_line(funnel):
         say(line)
     for count in count_reach(out):

@@ -40,9 +40,11 @@ class Funnel:
         precision, stable: (m,), successes that are precision grasps, and those that are also
             stable.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
-        elevations: (m, 3), distinct grasps among the samples, see `distinct_samples`, by object and
-            by the band of `BANDS` from which the palm approaches.
+        elevations: (m, 3), distinct grasps among the samples, see `distinct_grasps`, by object and
+            by the band of `BANDS` from which the palm approaches; grasps of an object in one
+            resting pose are compared, in the order of their trials.
         approach_cells: (m,), cells in which the object has a sample, see `approach_cells`.
+        in_splits, distinct_in_splits: (m, 3), samples, and distinct ones, by object and split.
     """
 
     names: tuple[str, ...]
@@ -54,6 +56,8 @@ class Funnel:
     removals: npt.NDArray[np.int64]
     elevations: npt.NDArray[np.int64]
     approach_cells: npt.NDArray[np.int64]
+    in_splits: npt.NDArray[np.int64]
+    distinct_in_splits: npt.NDArray[np.int64]
 
     @property
     def samples(self) -> npt.NDArray[np.int64]:
@@ -65,10 +69,27 @@ class Funnel:
         """(m,), distinct grasps among the samples of each object."""
         return self.elevations.sum(axis=1)
 
+    @property
+    def splits(self) -> list[SplitCount]:
+        """The rows of the paper's Table III."""
+        classes, counts = np.array(self.classes), list[SplitCount]()
+        for i, split in enumerate(SPLITS):
+            own = self.in_splits[:, i] > 0
+            counts.append(
+                SplitCount(
+                    split=split,
+                    samples=int(self.in_splits[:, i].sum()),
+                    distinct=int(self.distinct_in_splits[:, i].sum()),
+                    objects=int(own.sum()),
+                    classes=len(np.unique(classes[own])),
+                )
+            )
+        return counts
+
 
 @dataclass(frozen=True, kw_only=True)
 class SplitCount:
-    """A row of the paper's Table III: samples, distinct ones, objects and classes of a split."""
+    """Samples of a split, distinct ones, and their objects and classes."""
 
     split: str
     samples: int
@@ -95,18 +116,27 @@ def count_funnel(out: Path) -> Funnel:
     """Return the funnel of a dataset.
 
     Raises:
-        DataError: If trials.hdf5 is missing or damaged.
+        DataError: If trials.hdf5 is missing, or it or a data file is damaged.
     """
     trials = Trials(out)
     names, classes = (tuple(trials.objects[key].tolist()) for key in ("name", "class_name"))
     count, rows = len(names), Table(trials.columns(_COUNTED))
     lifted = rows[rows.removal != NONE]
 
-    # From where the palms of the samples approach.
-    samples = _samples(trials)
-    own = samples[samples.distinct]
-    bands = elevation_bands(multiply(own.X_TO, own.X_OG))
-    cells = np.unique(np.column_stack([samples.objects, approach_cells(samples.X_OG)]), axis=0)
+    # The samples; without data files, they are in no split.
+    kept = trials.where(kept=True)
+    samples = Table(kept.columns(("object", "resting", "X_TO", "X_OG", "split")))
+    X_TO, X_OG = unpack_pose(samples.X_TO), unpack_pose(samples.X_OG)
+    distinct = distinct_grasps(np.column_stack([samples.object, samples.resting]), X_OG)
+    in_split, shape = samples.split < len(SPLITS), (count, len(SPLITS))
+    in_splits, distinct_in_splits = (
+        _count(shape, samples.object[rows], samples.split[rows])
+        for rows in (in_split, in_split & distinct)
+    )
+
+    # From where their palms approach.
+    bands = elevation_bands(multiply(X_TO[distinct], X_OG[distinct]))
+    cells = np.unique(np.column_stack([samples.object, approach_cells(X_OG)]), axis=0)
 
     return Funnel(
         names=names,
@@ -116,8 +146,10 @@ def count_funnel(out: Path) -> Funnel:
         precision=_count((count,), rows.object[rows.precision]),
         stable=_count((count,), rows.object[rows.stable]),
         removals=_count((count, 1 + max(Removal)), lifted.object, lifted.removal),
-        elevations=_count((count, len(BANDS)), own.objects, bands),
+        elevations=_count((count, len(BANDS)), samples.object[distinct], bands),
         approach_cells=_count((count,), cells[:, 0]),
+        in_splits=in_splits,
+        distinct_in_splits=distinct_in_splits,
     )
 
 
@@ -125,30 +157,6 @@ def _count(shape: tuple[int, ...], *cells: AnyArray) -> npt.NDArray[np.int64]:
     """Return how often each cell of an array of a shape occurs among cells, by its indices."""
     flat = np.ravel_multi_index(cells, shape)
     return np.bincount(flat, minlength=np.prod(shape)).reshape(shape)
-
-
-def _samples(trials: Trials) -> Table:
-    """Return the samples among some attempts.
-
-    Columns: `ids`, their trials; `objects`, rows of /objects; `X_TO` and `X_OG` (n, 4, 4), poses of
-    object and palm before the hand closed; `distinct`, which of them are distinct grasps.
-    """
-    kept = trials.where(kept=True)
-    columns = kept.columns(("object", "resting", "X_TO", "X_OG"))
-    X_TO, X_OG = (unpack_pose(columns[name]) for name in ("X_TO", "X_OG"))
-    groups = np.column_stack([columns["object"], columns["resting"]])
-    objects = columns["object"].astype(np.int64)
-    distinct = distinct_grasps(groups, X_OG)
-    return Table(ids=kept.trial_ids, objects=objects, X_TO=X_TO, X_OG=X_OG, distinct=distinct)
-
-
-def distinct_samples(trials: Trials) -> npt.NDArray[np.int64]:
-    """Return the trials (n,) of the distinct grasps among the samples, see `distinct_grasps`.
-
-    Grasps of an object in one resting pose are compared, in the order of their trials.
-    """
-    samples = _samples(trials)
-    return samples.ids[samples.distinct]
 
 
 def lifted_note(funnel: Funnel) -> str:
@@ -159,30 +167,6 @@ def lifted_note(funnel: Funnel) -> str:
     ended = f"{counted(moved, 'lift')} ended early, without a verdict (moved)"
     why = "because the object moved more in the hand than a sample may"
     return f"the number of lifted grasps is a lower bound: {ended}, {why}"
-
-
-def count_splits(out: Path) -> list[SplitCount]:
-    """Return samples, distinct ones, objects and classes of each split.
-
-    Raises:
-        DataError: If a file is missing or damaged.
-    """
-    trials = Trials(out)
-    samples, counts = trials.where(kept=True), list[SplitCount]()
-    columns = samples.columns(("split", "object", "class_name"))
-    distinct = np.isin(samples.trial_ids, distinct_samples(trials))
-    for i, split in enumerate(SPLITS):
-        own = columns["split"] == i
-        counts.append(
-            SplitCount(
-                split=split,
-                samples=int(own.sum()),
-                distinct=int(distinct[own].sum()),
-                objects=len(np.unique(columns["object"][own])),
-                classes=len(set(columns["class_name"][own])),
-            )
-        )
-    return counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,7 +266,7 @@ def counts_as_dict(out: Path) -> dict[str, Any]:
     found = {
         "path": str(out),
         "objects": objects,
-        "splits": [asdict(split) for split in count_splits(out)],
+        "splits": [asdict(split) for split in funnel.splits],
     }
     # Most datasets have no files of arms.
     if counts := count_reach(out):

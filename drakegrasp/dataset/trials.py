@@ -180,7 +180,8 @@ class Trials:
                     raise DataError(f"{key} must be one of the dataset's, got {name!r}")
                 mask &= own[self["object"]]
         if kept is not None:
-            mask &= (self["removal"] == Removal.KEPT) == kept
+            removal = self._of_all("removal")[self.trial_ids]
+            mask &= (removal == Removal.KEPT) == kept
         return self[mask]
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, AnyArray]:

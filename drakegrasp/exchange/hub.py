@@ -34,7 +34,7 @@ from drakegrasp.dataset.schema import (
     SPLITS,
     Field,
 )
-from drakegrasp.dataset.statistics import count_splits
+from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import MachineError, counted
 from drakegrasp.runtime.progress import Report
 
@@ -169,7 +169,7 @@ def _card(out: Path, files: Mapping[str, list[dict[str, str]]], licence: str | N
     manifest, objects = read_manifest(out), dict[str, list[str]]()
     for entry in manifest.objects:
         objects.setdefault(entry.licence or "not stated", []).append(entry.name)
-    splits = (astuple(count) for count in count_splits(out))
+    splits = (astuple(count) for count in count_funnel(out).splits)
 
     head = {
         "license": licence or "unknown",

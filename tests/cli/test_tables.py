@@ -36,6 +36,8 @@ def test_columns_of_the_funnel_add_up_to_the_attempts() -> None:
         removals=removals,
         elevations=np.zeros((1, 3), dtype=np.int64),
         approach_cells=none,
+        in_splits=np.zeros((1, 3), dtype=np.int64),
+        distinct_in_splits=np.zeros((1, 3), dtype=np.int64),
     )
     row = cells(funnel)
     assert row["object"] == r"2_\[box]"  # rich prints it without the backslash

@@ -24,7 +24,7 @@ from drakegrasp.dataset.schema import (
     Field,
     sizes,
 )
-from drakegrasp.dataset.statistics import count_funnel, count_splits
+from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import DataError
 from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
@@ -92,7 +92,6 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (check_dataset, MANIFEST_FILE),
         (assemble, MANIFEST_FILE),
         (count_funnel, TRIALS),
-        (count_splits, TRIALS),
         (partial(claim_directory, config=load_config()), MANIFEST_FILE),
         (partial(replay_trial, trial_id=0), MANIFEST_FILE),
     ],

@@ -12,7 +12,6 @@ from drakegrasp.cli.tables import approach_line, funnel_table
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.statistics import (
     count_funnel,
-    count_splits,
     counts_as_dict,
 )
 from drakegrasp.filters import Removal
@@ -77,7 +76,7 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     table = funnel_table(funnel)
     assert list(table.columns[-1].cells) == [*map(str, funnel.distinct.tolist()), str(total)]
     assert approach_line(funnel).startswith(f"{total} distinct grasps in ")
-    assert sum(split.distinct for split in count_splits(out)) == total
+    assert sum(split.distinct for split in count_funnel(out).splits) == total
     said = counts_as_dict(out)
     assert said["objects"][0]["distinct"] == said["objects"][0]["approach_cells"] == 2
     assert said["objects"][0]["elevations"] == {"0-30": 1, "30-60": 0, "60-90": 1}
@@ -90,9 +89,9 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
 
 def test_splits_are_counted(out: Path) -> None:
     """By object each has one; by class the only one of a class is tested, and one of two others."""
-    assert [(c.samples, c.objects, c.classes) for c in count_splits(out)] == 3 * [(3, 1, 1)]
+    assert [(c.samples, c.objects, c.classes) for c in count_funnel(out).splits] == 3 * [(3, 1, 1)]
     assemble(out, overrides=["split.by=class"])
-    counts = {c.split: (c.samples, c.objects, c.classes) for c in count_splits(out)}
+    counts = {c.split: (c.samples, c.objects, c.classes) for c in count_funnel(out).splits}
     assert counts["test"] == (6, 2, 2)
     assert counts["train"][0] + counts["valid"][0] == 3
     assert counts["train"][1:] == counts["valid"][1:] == (1, 1)
@@ -102,5 +101,5 @@ def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
     """Two objects of three are boxes, and all three train."""
     shares = ("split.by=object", "split.test_fraction=0", "split.valid_fraction=0")
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=shares)
-    (train,) = (count for count in count_splits(out) if count.split == "train")
+    (train,) = (count for count in count_funnel(out).splits if count.split == "train")
     assert (train.samples, train.objects, train.classes) == (9, 3, 2)

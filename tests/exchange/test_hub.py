@@ -20,7 +20,7 @@ from PIL import Image
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS
-from drakegrasp.dataset.statistics import count_splits
+from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import MachineError
 from drakegrasp.exchange import hub
 from drakegrasp.exchange.export import export_dataset
@@ -115,7 +115,7 @@ def test_card_names_licence_files_and_samples(dataset: Path, folder: Path) -> No
         for entry in config["data_files"]:
             assert list(folder.glob(entry["path"]))
     assert described["pretty_name"] == "Simulated grasps of 3 objects"
-    for count in count_splits(dataset):
+    for count in count_funnel(dataset).splits:
         assert f"| {count.split} | {count.samples} | {count.distinct} |" in text
     assert "* not stated: 1_box_a, 2_box_b, 3_brick" in text
     assert str(GraspDataset(dataset / "grasping_oto.hdf5").K.tolist()) in text
