@@ -272,6 +272,13 @@ def test_a_collision_mesh_is_a_hull_of_few_corners(tmp_path: Path) -> None:
     assert trimesh.Trimesh(shape.vertices, shape.faces).volume > 0.9 * ball.volume
 
 
+def test_a_link_without_collision_shapes_gets_those_of_its_pictures(tmp_path: Path) -> None:
+    text = JAWS.replace(f'<collision><origin xyz="0 0.006 0.03"/>{JAW_BOX}</collision>', "")
+    model = read_model(write_model(tmp_path, text))
+    assert len(model.links["left_jaw"].collisions) == 1
+    assert "link left_jaw: the model has no collision shapes; hulls of its pictures" in model.notes
+
+
 def test_a_link_without_a_mass_gets_one_by_its_size(tmp_path: Path) -> None:
     text = JAWS.replace('<mass value="0.05"/>', '<mass value="0"/>', 1)
     model = read_model(write_model(tmp_path, text))

@@ -140,6 +140,10 @@ def test_mask_and_depth_agree(renderer: Renderer, X_TO: Array) -> None:
     # The table's pixels at the foot of the box come near to it.
     assert np.median(box_distance(inverted, HALF)) > 0.02
     assert box_distance(inverted, HALF).min() > -1e-6
+    assert abs(np.median(transform_points(X_TO, inverted)[:, 2])) < 1e-4  # most are on the table
+    # Types and ranges are those of the files.
+    assert (seen.image.dtype, seen.mask.dtype) == (np.float32, np.uint8)
+    assert 0.0 <= seen.image[:3].min() < seen.image[:3].max() <= 1.0
 
 
 def test_depth_beyond_the_box_moves_along_its_ray() -> None:
