@@ -20,7 +20,6 @@ from helpers.datasets import make_dataset
 from drakegrasp.api import building
 from drakegrasp.api.building import build_dataset
 from drakegrasp.api.verifying import run_verification, verify_grasp, verify_grasps
-from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared, save_prepared
 from drakegrasp.dataset.reader import GraspDataset
@@ -39,7 +38,7 @@ from drakegrasp.verification.placing import (
     place_on_object,
     place_on_rows,
 )
-from drakegrasp.verification.result import Verification, write_results
+from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import verify_batch
 
 pytestmark = pytest.mark.sim
@@ -69,35 +68,6 @@ def rows_of_two_objects(data: GraspDataset) -> list[int]:
     """Return the last row of each object, the last object first, then the first row of all."""
     names = data.column("object_props/object_name")
     return [int(np.flatnonzero(names == name)[-1]) for name in sorted(set(names))[::-1]] + [0]
-
-
-@pytest.mark.slow
-@pytest.mark.cluster
-@pytest.mark.nightly
-def test_workers_change_nothing(test_split: GraspDataset, tmp_path: Path) -> None:
-    rows = rows_of_two_objects(test_split)[:2]
-    grasps = test_split.column("grasps")[rows].astype(float)
-    config = read_manifest(test_split.path.parent).config
-    here = verify_grasps(grasps, test_split, rows=rows)
-    with connect(2) as client:
-        there = verify_grasps(grasps, test_split, rows=rows, client=client)
-    for name, results in (("here.h5", here), ("there.h5", there)):
-        write_results(results, tmp_path / name, config)
-    assert (tmp_path / "here.h5").read_bytes() == (tmp_path / "there.h5").read_bytes()
-    names = test_split.column("object_props/object_name")[rows]
-    assert [v.placed.model.name for v in here] == names.tolist()
-    assert all(isinstance(v.placed, PlacedObject) for v in here)
-
-
-def test_results_come_in_the_order_of_the_grasps(cube: PlacedObject) -> None:
-    off = GRASP.copy()
-    off[0, 0] = np.nan
-    order = [off, GRASP, off, GRASP]
-    results = verify_grasps([g.ravel() for g in order], cube)
-    assert [v.outcome for v in results] == [
-        Outcome.INVALID if g is off else Outcome.SUCCESS for g in order
-    ]
-    np.testing.assert_array_equal([v.p_OQ[0, 0] for v in results], [g[0, 0] for g in order])
 
 
 def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
@@ -358,15 +328,7 @@ def _never() -> Iterator[Client]:
     yield
 
 
-def test_one_worker_is_this_process(cube: PlacedObject, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = "drakegrasp.api.verifying"
-    monkeypatch.setattr(f"{module}.FEW_GRASPS", 0)
-    monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
-    grasps = place(GRASP.ravel(), cube)
-    assert run_verification(grasps, cube.config, workers=1, show=False) == [run_here]
-
-
-def test_few_grasps_are_verified_in_this_process(
+def test_few_grasps_and_those_of_one_worker_are_verified_in_this_process(
     cube: PlacedObject, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four are few, and five are not."""
@@ -374,7 +336,9 @@ def test_few_grasps_are_verified_in_this_process(
     monkeypatch.setattr(f"{module}.verify_batch", lambda grasps, execute, *_, **__: [execute])
     monkeypatch.setattr("drakegrasp.cluster.connect.joined", lambda *_: _none())
     four, five = (place([GRASP.ravel()] * count, cube) for count in (4, 5))
-    assert run_verification(four, cube.config, show=False) == [run_here]
+    for grasps, workers in ((four, None), (five, 1)):
+        found = run_verification(grasps, cube.config, workers=workers, show=False)
+        assert found == [run_here]
     with pytest.raises(MachineError, match="no workers"):
         run_verification(five, cube.config, show=False)
 

@@ -39,14 +39,6 @@ def test_product_adds_its_terms_in_order(k: int) -> None:
     np.testing.assert_allclose(multiply(A, B), A @ B, atol=1e-15)
 
 
-def test_order_of_terms_is_that_of_the_arguments() -> None:
-    """In another order nothing would cancel: 1 is lost in 1e16 + 1."""
-    ones = [1.0, 1.0, 1.0]
-    for product in (dot, lambda a, b: multiply([a], b)[0]):
-        assert product([1e16, 1.0, -1e16], ones) == 0.0
-        assert product([1e16, -1e16, 1.0], ones) == 1.0
-
-
 @pytest.mark.parametrize(
     ("left", "right"),
     [
@@ -82,11 +74,6 @@ def test_dot_and_norm_are_those_of_loops(k: int) -> None:
     )
 
 
-def test_norm_of_one_vector_and_of_none() -> None:
-    assert norm([3.0, 4.0]) == 5.0 and norm([3, 4]).shape == ()
-    assert norm(np.zeros((0, 3))).shape == (0,)
-
-
 def test_integers_are_taken_for_real_numbers() -> None:
     assert multiply([[1, 2]], [[3], [4]]).tolist() == [[11.0]]
     assert dot([2**40, 1], [2**40, 1]) == 2.0**80 + 1.0
@@ -94,22 +81,14 @@ def test_integers_are_taken_for_real_numbers() -> None:
 
 @pytest.mark.parametrize("largest", [np.pi / 4, 2.0 * np.pi, 100.0, 1e4, 2e6 * np.pi])
 def test_sine_and_cosine_agree_with_the_c_library(largest: float) -> None:
+    """Near quarter turns, too, where one vanishes: the error is of the reduced angle."""
     angles = np.random.default_rng(0).uniform(-largest, largest, 20_000)
-    sine, cosine = sin_cos(angles)
-    np.testing.assert_allclose(sine, [math.sin(x) for x in angles.tolist()], rtol=0, atol=TOLERANCE)
-    np.testing.assert_allclose(
-        cosine, [math.cos(x) for x in angles.tolist()], rtol=0, atol=TOLERANCE
-    )
-
-
-@pytest.mark.parametrize("turns", [0, 1, -1, 250_000, 999_999])
-def test_angles_near_quarter_turns_keep_their_digits(turns: int) -> None:
-    """Where sine or cosine vanishes the error must, too: it is of the reduced angle."""
-    quarters = 4 * turns + np.arange(4)
-    angles = quarters * (np.pi / 2.0) + np.array([[0.0], [1e-9], [-1e-3], [np.pi / 4]])
-    for ours, exact in zip(sin_cos(angles), (math.sin, math.cos), strict=True):
-        reference = [[exact(x) for x in row] for row in angles.tolist()]
-        np.testing.assert_allclose(ours, reference, rtol=0, atol=TOLERANCE)
+    quarters = np.rint(angles[:200] / (np.pi / 2.0)) * (np.pi / 2.0)
+    near = quarters + np.array([[0.0], [1e-9], [-1e-3], [np.pi / 4]])
+    for given in (angles, near.ravel()):
+        for ours, exact in zip(sin_cos(given), (math.sin, math.cos), strict=True):
+            reference = [exact(x) for x in given.tolist()]
+            np.testing.assert_allclose(ours, reference, rtol=0, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("turns", [0, 1, -1, -7, 1_000_000])

@@ -30,13 +30,7 @@ import torch
 from assess import assessment, auc
 from batches import centred, object_points, turned
 from fitting import ahead
-from networks import (
-    HandCoordinates,
-    PostureNetwork,
-    PostureSize,
-    farthest_points,
-    orthonormal,
-)
+from networks import HandCoordinates, PostureNetwork, PostureSize, farthest_points, orthonormal
 from predict import proposals
 from train import temperature
 

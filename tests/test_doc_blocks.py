@@ -16,12 +16,14 @@ import trimesh
 import yaml
 from helpers.commands import run
 from helpers.datasets import BOXES
+from helpers.isaac import isaac_grasp, write_isaac
 from helpers.meshes import write_fixed
 from helpers.tables import table
 from helpers.tiers import in_second_tier
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import Decisions, write_decisions
+from drakegrasp.frames import make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.objects.surroundings import load_surroundings
@@ -234,13 +236,10 @@ def test_commands_that_simulate_run(
         grasps[1:, :9] += 0.03  # [m]; off the surface, which is known without a simulation
         np.save(tmp_path / "predictions.npy", grasps)
     # Palm poses as GraspGen writes them: one from above, of a mesh and of an object of the dataset.
-    above = {"confidence": 0.9, "position": [0.0, 0.0, 0.2]}
-    above["orientation"] = {"w": 0.0, "xyz": [1.0, 0.0, 0.0]}
-    palms = {"format": "isaac_grasp", "format_version": 1.0, "grasps": {"grasp_0": above}}
-    (tmp_path / "PREDICTED").mkdir()
+    above = isaac_grasp(make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.2]))
     name = str(data.column("object_props/object_name")[0])
     for path in (tmp_path / "mug.yaml", tmp_path / "PREDICTED" / f"{name}.yaml"):
-        path.write_text(yaml.safe_dump(palms))
+        write_isaac(path, grasp_0=above)
     with h5py.File(tmp_path / "predictions.h5", "w") as file:
         file["test/grasps"], file["test/rows"] = data.column("grasps")[:1], np.array([0])
 

@@ -23,26 +23,8 @@ from helpers.scripts import load_script
 import drakegrasp
 from drakegrasp.cli.main import COMMANDS, app
 from drakegrasp.config import Config
-from drakegrasp.dataset.schema import (
-    DATA_FIELDS,
-    LOOK_FIELDS,
-    OBJECT_FIELDS,
-    PREDICTED_ROW_FIELDS,
-    SUCCESS_FIELDS,
-    TRIAL_FIELDS,
-    VERIFICATION_FIELDS,
-)
 
 ROOT = Path(__file__).resolve().parents[1]
-TABLES = (
-    DATA_FIELDS,
-    TRIAL_FIELDS,
-    LOOK_FIELDS,
-    OBJECT_FIELDS,
-    PREDICTED_ROW_FIELDS,
-    SUCCESS_FIELDS,
-    VERIFICATION_FIELDS,
-)
 FORMAT_PAGE = ROOT / "docs" / "reference" / "dataset-format.md"
 BUILTIN_PAGE = ROOT / "docs" / "reference" / "builtin-objects.md"
 COMMAND_PAGE = ROOT / "docs" / "reference" / "command-line.md"
@@ -89,12 +71,6 @@ def test_generated_page_is_what_the_code_says(
     assert main(["--check", str(stale)]) == 1
     assert main([str(stale)]) == 0
     assert stale.read_bytes() == page.read_bytes()
-
-
-def test_field_names_are_unique_in_their_table() -> None:
-    for table in TABLES:
-        names = [field.name for field in table]
-        assert len(names) == len(set(names))
 
 
 @pytest.mark.parametrize("page", DOCS, ids=page_id)

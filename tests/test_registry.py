@@ -12,8 +12,6 @@ import pytest
 from drakegrasp import registry
 from drakegrasp.config import parse_config, parse_stored
 from drakegrasp.errors import ConfigError, MachineError
-from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import MODELS, hand_names
 from drakegrasp.hand.settings import load_config
 
 KINDS: tuple[registry.Kind, ...] = ("clusters", "exporters", "importers", "protocols", "samplers")
@@ -81,14 +79,6 @@ def test_names_of_others_follow_and_take_none_of_ours() -> None:
 def test_what_cannot_be_used_is_one_line(name: str, words: str, kind: type[Exception]) -> None:
     with pytest.raises(kind, match=words):
         registry.find("exporters", name)
-
-
-def test_hand_of_another_package_is_used_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("claw", "tests_of_hands:FILE", "")
-    monkeypatch.setattr(EntryPoint, "load", lambda self: str(MODELS / "franka_hand.yaml"))
-    monkeypatch.setattr(registry, "_theirs", lambda kind: {"claw": entry})
-    assert "claw" in hand_names()
-    assert load_hand("claw").joint_names == load_hand("franka").joint_names
 
 
 def test_a_dataset_opens_where_its_sampler_and_its_rule_are_not_installed() -> None:

@@ -6,19 +6,22 @@ through a command that reads the file, and names all kinds that had another answ
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import signal
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import uvicorn
 import yaml
 from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds, trees
-from helpers.bad_inputs.kinds import Kind, Workplace
+from helpers.bad_inputs.kinds import Kind
 from helpers.commands import Result
 from helpers.commands import run as run_command
 from helpers.datasets import OTO, REPEATED, TRIALS, make_dataset
@@ -58,15 +61,13 @@ COMMANDS = {
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sound dataset with meshes, a hand file, decisions and predictions."""
     base = tmp_path_factory.mktemp("sound")
-    (base / "meshes").mkdir()
     out = make_dataset(base / "out", base / "meshes", overrides=REPEATED)
     manifest = json.loads((out / MANIFEST).read_text())
-    key = {"object": "1_box_a", "candidate": 0, "standoff_index": 0}
     manifest["refused"] = [{"name": "4_cup", "mesh_sha256": "0" * 64, "reason": "open"}]
     manifest["fingers"] = {"finger_1": True, "finger_2": True, "finger_3": True}
-    manifest["rejected"] = [key]
-    (base / "manifest.json").write_text(json.dumps({**manifest, DIGEST: manifest_digest(manifest)}))
-    (base / "reject.json").write_text(json.dumps({"version": 1, "rejected": [key], "kept": [key]}))
+    manifest["rejected"] = [manifests.KEY]
+    (base / MANIFEST).write_text(json.dumps({**manifest, DIGEST: manifest_digest(manifest)}))
+    (base / REJECT).write_bytes(manifests.SOUND_DECISIONS)
     return base
 
 
@@ -143,33 +144,56 @@ def wrong_answer(result: Result, names: Sequence[str]) -> str | None:
     return None
 
 
-def walk(base: Path, tmp_path: Path, file: str, kinds: Sequence[Kind], command: str) -> None:
-    """Give each kind of a file to a command; fail with all answers that are wrong."""
-    place, to = tmp_path / "place", tmp_path / "to"
-    to.mkdir()
-    pristine = Path(shutil.copytree(base / "out", tmp_path / "pristine"))
-    if file in (MANIFEST, REJECT):
-        shutil.copy(base / file, pristine / file)
-    work = Workplace(pristine, place)
+def state(folder: Path) -> dict[str, tuple[int, ...]]:
+    """Return what changes when something below a folder is written or replaced."""
+    found = {}
+    for path in folder.rglob("*"):
+        status = path.lstat()
+        times = () if path.is_dir() else (status.st_mtime_ns, status.st_size, status.st_ino)
+        found[str(path.relative_to(folder))] = (status.st_mode, *times)
+    return found
 
-    wrong = {}
+
+def walk(
+    tmp_path: Path,
+    make: Callable[[Path], Path],
+    kinds: Sequence[Kind],
+    command: str,
+    names: Sequence[str],
+    *,
+    may_pass: bool = False,
+    **places: Path,
+) -> None:
+    """Give each kind of a file to a command; fail with all answers that are wrong.
+
+    Args:
+        tmp_path: For a folder of each kind, `{out}`, and for what the command writes, `{to}`.
+        make: Makes what is sound in a folder; returns the file to spoil, `{file}`.
+        kinds: Ways to spoil it.
+        command: Its words.
+        names: What an error must name one of.
+        may_pass: Whether a kind may be as good as the sound file.
+        **places: Other words in braces.
+    """
+    wrong, folder, to = dict[str, str](), tmp_path / "place", tmp_path / "to"
     for kind in kinds:
-        kind.spoil(place / file)
-        before = work.state()
-        result = run(COMMANDS[command].split(), out=place, to=to, meshes=base / "meshes", file=file)
-        answer = wrong_answer(result, (Path(file).name, Path(file).stem.partition(".")[0]))
-        after = work.state()
-        if answer is None and after != before:
-            changed = {n for n in after.keys() | before.keys() if after.get(n) != before.get(n)}
-            answer = f"changed {sorted(changed)}"
-        if answer is None and any(to.iterdir()):
-            answer = f"left {[path.name for path in to.iterdir()]}"
-        if answer is not None:
-            wrong[kind.name] = answer
-        shutil.rmtree(to)
         to.mkdir()
-        work.restore()
-    report(f"{file} / {command}", kinds, wrong)
+        file = make(folder)
+        kind.spoil(file)
+        before = state(folder)
+        result = run(command.split(), **{"out": folder, "to": to, "file": file, **places})
+        if not (may_pass and result.exit_code == 0):
+            answer = wrong_answer(result, names)
+            after = state(folder)
+            if answer is None and after != before:
+                changed = {n for n in after.keys() | before.keys() if after.get(n) != before.get(n)}
+                answer = f"changed {sorted(changed)}"
+            if answer is None and any(to.iterdir()):
+                answer = f"left {[path.name for path in to.iterdir()]}"
+            wrong |= {} if answer is None else {kind.name: answer}
+        shutil.rmtree(to)
+        shutil.rmtree(folder)
+    report(command, kinds, wrong)
 
 
 def report(title: str, kinds: Sequence[object], wrong: dict[str, str]) -> None:
@@ -177,24 +201,24 @@ def report(title: str, kinds: Sequence[object], wrong: dict[str, str]) -> None:
     assert not wrong, f"{title}: {len(wrong)} of {len(kinds)} kinds:\n" + "\n".join(lines)
 
 
-#: By file: how it can be spoiled, unless that follows from its content, and who reads it.
-FILES: dict[str, tuple[Sequence[Kind], tuple[str, ...]]] = {
+#: By file: how it can be spoiled, which may follow from a sound one, and who reads it.
+FILES: dict[str, tuple[Any, tuple[str, ...]]] = {
     MANIFEST: (
-        (),
+        manifests.manifest_kinds,
         (
             *("replay", "stats", "assemble", "check", "figures", "export isaac_grasp"),
             *("export dexgraspbench", "verify", "build"),
         ),
     ),
     TRIALS: (
-        (),
+        hdf5_kinds.trials_kinds,
         (
             *("stats", "check", "replay", "figures", "inspect", "export isaac_grasp"),
             "export dexgraspbench",
         ),
     ),
     OTO: (
-        (),
+        hdf5_kinds.data_kinds,
         (
             *("stats", "check", "inspect", "export isaac_grasp", "export dexgraspbench"),
             *("export original", "export hf", "verify"),
@@ -203,20 +227,30 @@ FILES: dict[str, tuple[Sequence[Kind], tuple[str, ...]]] = {
     SHARD: (hdf5_kinds.SEALED, ("assemble", "check")),
     PLAN: (hdf5_kinds.SEALED, ("replay", "check")),
     MODEL: (array_kinds.MODEL, ("replay", "assemble", "check")),
+    REJECT: (manifests.DECISIONS, ("inspect",)),
 }
 
 
 def kinds_of(base: Path, file: str) -> Sequence[Kind]:
     """Return how a file can be spoiled."""
-    by_content = {
-        MANIFEST: (manifests.manifest_kinds, base),
-        TRIALS: (hdf5_kinds.trials_kinds, base / "out"),
-        OTO: (hdf5_kinds.data_kinds, base / "out"),
-    }
-    if file not in by_content:
-        return FILES[file][0]
-    kinds, folder = by_content[file]
-    return kinds(folder / file)
+    kinds = FILES[file][0]
+    sound = base if file == MANIFEST else base / "out"
+    return kinds(sound / file) if callable(kinds) else kinds
+
+
+def walk_dataset(
+    base: Path, tmp_path: Path, file: str, kinds: Sequence[Kind], command: str
+) -> None:
+    """Give each kind of a file of the dataset to a command."""
+
+    def make(folder: Path) -> Path:
+        shutil.copytree(base / "out", folder)
+        if file in (MANIFEST, REJECT):
+            shutil.copy(base / file, folder / file)
+        return folder / file
+
+    names = (Path(file).name, Path(file).stem.partition(".")[0])
+    walk(tmp_path, make, kinds, COMMANDS[command], names, meshes=base / "meshes")
 
 
 every_command = pytest.mark.parametrize(
@@ -233,134 +267,87 @@ def test_files(base: Path, tmp_path: Path, file: str, command: str) -> None:
     k = FILES[file][1].index(command)
     # The whole dataset is checked for each.
     share = 160 if command == "check" else 80 if k else 10
-    walk(base, tmp_path, file, kinds_of(base, file)[k % share :: share], command)
+    walk_dataset(base, tmp_path, file, kinds_of(base, file)[k % share :: share], command)
 
 
 @pytest.mark.nightly
 @every_command
 def test_every_kind_with_every_command(base: Path, tmp_path: Path, file: str, command: str) -> None:
-    walk(base, tmp_path, file, kinds_of(base, file), command)
+    walk_dataset(base, tmp_path, file, kinds_of(base, file), command)
+
+
+def _npy() -> bytes:
+    content = io.BytesIO()
+    np.save(content, array_kinds.GRASP)
+    return content.getvalue()
+
+
+def _hdf5() -> bytes:
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file.update(array_kinds.ROWS)
+    return content.getvalue()
 
 
 OBJECTS_YAML = (
     b"units: m\nlicence: x\nobjects:\n"
     b"  1_box_a: {friction: 0.5, mass: 1.0, scale: 1.0, up: +z, class: box, group: a}\n"
 )
-AUDIT = "audit {meshes} --json {to}/a.json"
-
-
-def walk_file(
-    base: Path,
-    tmp_path: Path,
-    sound: bytes,
-    suffix: str,
-    kinds: Sequence[Kind],
-    command: str,
-    *names: str,
-    may_pass: bool = False,
-) -> None:
-    """Give each kind of a single file to a command; fail with all answers that are wrong.
-
-    Args:
-        base: Of the sound dataset and its meshes.
-        tmp_path: Where the file is written.
-        sound: Its content, which the kinds spoil.
-        suffix: Its suffix.
-        kinds: Ways to spoil it.
-        command: Its words; `{file}` stands for the file, `{to}` for where results go.
-        names: What an error must name one of, if not the file.
-        may_pass: Whether a kind may be as good as the sound file.
-    """
-    file, to, wrong = tmp_path / f"spoiled{suffix}", tmp_path / "to", {}
-    places = {"file": file, "to": to, "meshes": base / "meshes", "out": tmp_path / "out"}
-    places["mesh"] = base / "meshes" / "1_box_a.stl"
-    for kind in kinds:
-        to.mkdir()
-        file.write_bytes(sound)
-        kind.spoil(file)
-        result = run(command.split(), **places, data=base / "out" / OTO, tmp=tmp_path)
-        passed = may_pass and result.exit_code == 0
-        answer = None if passed else wrong_answer(result, ("spoiled", *names))
-        if answer is None and not passed and any(to.iterdir()):
-            answer = f"left {[path.name for path in to.iterdir()]}"
-        if answer is not None:
-            wrong[kind.name] = answer
-        shutil.rmtree(to)
-        shutil.rmtree(file) if file.is_dir() else file.unlink()
-    report(f"{command.split()[0]} {suffix}", kinds, wrong)
-
-
-def _npy(path: Path, array: np.ndarray) -> bytes:
-    np.save(path / "sound.npy", array)
-    return (path / "sound.npy").read_bytes()
-
-
-#: Predictions by suffix: how they can be spoiled, and what they are verified against.
-PREDICTIONS = {
-    ".npy": (array_kinds.PREDICTIONS_NPY, "--object {mesh}"),
-    ".h5": (array_kinds.PREDICTIONS_HDF5, "--dataset {data}"),
-}
-
-
-@pytest.mark.parametrize("suffix", PREDICTIONS)
-def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
-    import h5py
-
-    sound = _npy(tmp_path, array_kinds.GRASP)
-    if suffix == ".h5":
-        with h5py.File(tmp_path / "sound.h5", "w") as file:
-            file["grasps"] = np.tile(array_kinds.GRASP, (2, 1))
-            file["rows"] = np.arange(2)
-        sound = (tmp_path / "sound.h5").read_bytes()
-    kinds, target = PREDICTIONS[suffix]
-    command = f"verify {{file}} {target} --out {{to}}/verdicts.h5 --workers 1 --quiet"
-    walk_file(base, tmp_path, sound, suffix, kinds, command, "rows", "contact points")
-
-
-def test_decisions(base: Path, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(base / "out", tmp_path / "out"))
-    before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file}"
-    sound = (base / REJECT).read_bytes()
-    walk_file(base, tmp_path, sound, ".json", manifests.DECISIONS, command)
-    assert (out / MANIFEST).read_bytes() == before
-
-
-def test_decisions_in_the_dataset(base: Path, tmp_path: Path) -> None:
-    walk(base, tmp_path, REJECT, manifests.DECISIONS[::5], "inspect")
-
-
-#: By what a YAML file is of: its sound content, the command that reads it, and which share of the
-#: ways to spoil a value is tried.
-YAML_FILES = {
+DRY = "build --objects {meshes} --out {to}/out --dry-run"
+VERIFY = "verify {file} --out {to}/verdicts.h5 --workers 1 --quiet"
+#: By what a file alone is of: its suffix, its sound content, how it can be spoiled, the command
+#: that reads it, and which share of the ways to spoil a value of YAML is tried, if any.
+ALONE: dict[str, tuple[Any, ...]] = {
+    "grasps": (".npy", _npy(), array_kinds.PREDICTIONS_NPY, f"{VERIFY} --object {{mesh}}", 0),
+    "grasps of rows": (
+        *(".h5", _hdf5(), array_kinds.PREDICTIONS_HDF5, f"{VERIFY} --dataset {{data}}"),
+        0,
+    ),
+    "decisions": (
+        *(".json", manifests.SOUND_DECISIONS, manifests.DECISIONS),
+        *("assemble {sound} --reject {file}", 0),
+    ),
+    "hand": (
+        *(".yaml", (MODELS / "barrett_hand.yaml").read_bytes(), text_kinds.ANY_YAML),
+        *("build --objects {meshes} --out {to}/out --set hand={file} --workers 1 --quiet", 53),
+    ),
     "configuration": (
-        yaml.safe_dump(load_config("fast").to_dict()).encode(),
-        "build --objects {meshes} --out {to}/out --config {file} --dry-run",
-        53,
+        *(".yaml", yaml.safe_dump(load_config("fast").to_dict()).encode(), text_kinds.ANY_YAML),
+        *(f"{DRY} --config {{file}}", 53),
     ),
-    "objects": (
-        OBJECTS_YAML,
-        "build --objects {meshes} --out {to}/out --dry-run --manifest {file}",
-        5,
-    ),
+    "objects": (".yaml", OBJECTS_YAML, text_kinds.ANY_YAML, f"{DRY} --manifest {{file}}", 5),
     # The same function reads the file for it.
-    "objects of an audit": (OBJECTS_YAML, f"{AUDIT} --manifest {{file}}", 17),
+    "objects of an audit": (
+        *(".yaml", OBJECTS_YAML, text_kinds.ANY_YAML[::4]),
+        *("audit {meshes} --json {to}/a.json --manifest {file}", 17),
+    ),
 }
 
 
-@pytest.mark.parametrize("name", YAML_FILES)
-def test_yaml_files(base: Path, tmp_path: Path, name: str) -> None:
-    """Some values are as good as those before; which are bad: test_config.py, test_sources.py."""
-    sound, command, each = YAML_FILES[name]
-    kinds = text_kinds.ANY_YAML[:: 4 if "audit" in name else 1]
-    walk_file(base, tmp_path, sound, ".yaml", kinds, command)
-    spoiled = [*trees.some_values(yaml.safe_load(sound), each)]
-    walk_file(base, tmp_path, sound, ".yaml", spoiled, command, "1_box_a", may_pass=True)
+@pytest.mark.parametrize("name", ALONE)
+def test_files_alone(base: Path, tmp_path: Path, name: str) -> None:
+    """Some values are as good as those before.
 
+    Which are bad: test_config.py, test_sources.py, tests/hand.
+    """
+    suffix, content, kinds, command, each = ALONE[name]
+    sound = Path(shutil.copytree(base / "out", tmp_path / "sound"))
+    places = {"meshes": base / "meshes", "mesh": base / "meshes" / "1_box_a.stl"}
+    places |= {"sound": sound, "data": sound / OTO}
+    before = state(sound)
 
-def test_hand_files(base: Path, tmp_path: Path) -> None:
-    sound = (MODELS / "barrett_hand.yaml").read_bytes()
-    command = "build --objects {meshes} --out {to}/out --set hand={file} --workers 1 --quiet"
-    walk_file(base, tmp_path, sound, ".yaml", text_kinds.HAND, command)
+    def make(folder: Path) -> Path:
+        folder.mkdir()
+        (folder / f"spoiled{suffix}").write_bytes(content)
+        return folder / f"spoiled{suffix}"
+
+    names = ("spoiled", "rows", "contact points")
+    walk(tmp_path, make, kinds, command, names, **places)
+    if each:
+        spoiled = [*trees.some_values(yaml.safe_load(content), each)]
+        names = ("spoiled", "1_box_a")
+        walk(tmp_path, make, spoiled, command, names, may_pass=True, **places)
+    assert state(sound) == before
 
 
 #: How the lines about some options call them.

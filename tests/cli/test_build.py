@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -20,6 +21,7 @@ import pytest
 import trimesh
 from distributed.security import Security
 from helpers import datasets
+from helpers.assertions import contents
 from helpers.builds import start_build, workers_of
 from helpers.commands import Result, run
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
@@ -42,54 +44,45 @@ LAST = len(FILES)
 SLIPPED = ("--set", f"filters.max_slip={SLIP / 2}")
 
 
-def state(out: Path) -> dict[str, bytes]:
-    """Return the files of a dataset's directory by their names, and of no folder."""
-    return {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--reject", "reject.json"], "must be a list of rejections of drakegrasp inspect"),
-        (["--set", "filters.max_slip=-1"], "must be greater than 0"),
-        (
-            ["--set", "lift.hold_time=9"],
-            "filters, split, verify can change, got one that changes what was simulated",
-        ),
+        ("--reject reject.json", "must be a list of rejections of drakegrasp inspect"),
+        ("--set filters.max_slip=-1", "must be greater than 0"),
+        ("--set lift.hold_time=9", "verify can change, got one that changes what was simulated"),
+        ("", "must be built by one process at a time"),
     ],
-    ids=["reject", "value", "key"],
+    ids=["reject", "value", "key", "beside a build"],
 )
 def test_refused_assemble_changes_nothing(
-    out: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str
+    out: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, words: str
 ) -> None:
     """Neither the files nor the filters that the next build would use."""
     monkeypatch.chdir(out.parent)
     Path("reject.json").write_text("[]")
-    before = state(out)
-    result = run("assemble", out, *SLIPPED, *arguments)
-    assert result.exit_code in (1, 2)
-    assert words in result.stderr
-    assert state(out) == before
+    with nullcontext() if arguments else build_lock(out):
+        before = contents(out)
+        result = run("assemble", out, *SLIPPED, *arguments.split())
+        assert result.exit_code in (1, 2)
+        assert words in result.stderr
+        assert contents(out) == before
 
 
 def test_assemble_says_which_rejections_had_no_effect(out: Path) -> None:
-    keys = [AttemptKey("1_box_a", 0, 0), AttemptKey("0_gone", 0, 0)]
-    write_decisions(out / "reject.json", Decisions(rejected=frozenset(keys)))
-    result = run("assemble", out, "--reject", out / "reject.json")
+    """Of a success, of a failure, and of an object that is gone; the first counts."""
+    path = out / "reject.json"
+    success, failure = (AttemptKey("1_box_a", 0, standoff) for standoff in (0, 1))
+    gone = AttemptKey("0_gone", 0, 0)
+    write_decisions(path, Decisions(rejected=frozenset([success, failure, gone])))
+    result = run("assemble", out, "--reject", path)
     assert result.exit_code == 0
-    assert "skipped 1 of 2 rejections, which name no success" in result.stdout
-    result = run("assemble", out)
-    assert result.exit_code == 0
-    assert f"{out / 'reject.json'}: rejections that were not used: 2" in result.stdout
-
-
-def test_assemble_beside_a_build_does_not_change_its_filters(out: Path) -> None:
-    with build_lock(out):
-        before = state(out)
-        result = run("assemble", out, *SLIPPED)
-        assert result.exit_code == 1
-        assert "must be built by one process at a time" in result.stderr
-        assert state(out) == before
+    assert "skipped 2 of 3 rejections, which name no success" in result.stdout
+    assert "0_gone, palm pose 0, stand-off 0; 1_box_a, palm pose 0, stand-off 1" in result.stdout
+    assert read_manifest(out).rejected == (success,)
+    assert f"{path}: rejections that were not used: 3" in run("assemble", out).stdout
+    # A file that cannot be read is no matter of an assembly that does not use it.
+    path.write_text("broken")
+    assert run("assemble", out).exit_code == 0
 
 
 #: Assembles copies of a dataset without samples, and dies when the file of the number that is the
@@ -158,7 +151,9 @@ def test_files_are_of_one_state_or_told_whenever_assembling_is_killed(
 ) -> None:
     """The manifest is the last: while it is the old one, new files are told."""
     out = Path(shutil.copytree(killed(rename), tmp_path / "out"))
-    assert run("stats", out).exit_code == (rename > 0)
+    stats = run("stats", out)
+    assert stats.exit_code == (rename > 0)
+    assert ("files must be those of manifest.json, got others" in stats.stderr) == (rename > 0)
     if rename == 0:
         assert samples(out) == [3] * 4
     else:

@@ -7,9 +7,9 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -24,7 +24,6 @@ from drakegrasp.cli.arguments import What
 from drakegrasp.cli.console import say
 from drakegrasp.cli.main import COMMANDS
 from drakegrasp.config import preset_names
-from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.errors import DataError
 from drakegrasp.hand.settings import load_config
 from drakegrasp.pictures import figures
@@ -162,6 +161,8 @@ NO_DATASET = [
     ("check {tmp}", "{tmp}"),
     ("assemble {tmp}", "{tmp}"),
     ("figures {tmp} --quiet", "{tmp}/trials.hdf5: must be the trials"),
+    ("export {tmp} {tmp}/to --to original", "must be a data file of drakegrasp"),
+    ("inspect {tmp}/none", "must be the directory of a dataset"),
 ]
 
 
@@ -283,11 +284,7 @@ def test_build_reports_and_says_when_nothing_is_left_to_do(
 
 @pytest.mark.sim
 @pytest.mark.slow
-def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path: Path) -> None:
-    assert "no broken invariants" in run("check", small_dataset).stdout
-    stats = run("stats", small_dataset).stdout
-    assert "8_wineglass_flute" in stats
-    assert "Samples by split" in stats
+def test_replay_says_what_was_and_records_it(small_dataset: Path, tmp_path: Path) -> None:
     page = tmp_path / "trial.html"
     again = run("replay", small_dataset, "--trial", "0", "--html", page)
     assert again.exit_code == 0
@@ -313,15 +310,6 @@ def test_check_prints_one_document_of_json(out: Path) -> None:
     (checked,) = map(json.loads, result.stdout.splitlines())
     assert result.exit_code == 1 and checked["path"] == str(out)
     assert "grasping_oto.hdf5" in {broken["file"] for broken in checked["broken"]}
-
-
-def test_stats_of_files_of_another_state_are_one_line(out: Path) -> None:
-    assert "Samples by split (by object)" in run("stats", out).stdout
-    manifest = read_manifest(out)
-    write_manifest(replace(manifest, versions={**manifest.versions, "drake": "other"}), out)
-    result = run("stats", out)
-    assert result.exit_code != 0
-    assert "files must be those of manifest.json, got others" in result.stderr
 
 
 def test_findings_of_an_audit_are_written_as_json(tmp_path: Path) -> None:
@@ -417,3 +405,58 @@ def test_module_runs_as_a_program() -> None:
         [script, "--version"], capture_output=True, text=True, check=True, env=os.environ
     )
     assert result.stdout.startswith("drakegrasp, version ")
+
+
+# Ctrl-C and SIGTERM end a command wherever it is
+
+
+#: A library that swallows whatever is raised while it is imported.
+GREEDY = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.{name})
+    time.sleep(0.2)
+    whole = True
+except BaseException:
+    pass
+"""
+COMMAND = """
+import sys, time
+from drakegrasp.cli.console import run_command
+
+def command(words, **_):
+    import greedy
+    print(f"whole: {greedy.whole}", flush=True)
+    time.sleep(20.0)
+    print("went on")
+
+sys.path.insert(0, sys.argv.pop())
+run_command(command, [], resumable=True)
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_signal_in_an_import_ends_the_command_after_it(
+    tmp_path: Path, name: str, code: int
+) -> None:
+    """The library is there whole, and the command does not go on."""
+    (tmp_path / "greedy.py").write_text(GREEDY.format(name=name))
+    found = subprocess.run(
+        [sys.executable, "-c", COMMAND, str(tmp_path)], capture_output=True, text=True, timeout=60
+    )
+    assert (found.returncode, found.stdout) == (code, "whole: True\n")
+    assert found.stderr == "stopped; the same command continues from here\n"
+
+
+def test_signal_that_the_shell_ignores_stays_ignored(tmp_path: Path) -> None:
+    """As in the background of a shell, or under nohup."""
+    (tmp_path / "greedy.py").write_text(GREEDY.format(name="SIGINT"))
+    shorter = COMMAND.replace("20.0", "0.5")
+    found = subprocess.run(
+        [sys.executable, "-c", shorter, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )
+    assert (found.returncode, found.stdout) == (0, "whole: True\nwent on\n")

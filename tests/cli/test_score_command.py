@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.commands import error_line, run
-from helpers.datasets import OTO, make_dataset
+from helpers.datasets import OTO
 from helpers.tiers import few
 
 from drakegrasp.dataset.manifest import read_manifest
@@ -20,6 +20,13 @@ from drakegrasp.scoring.benchmark import read_benchmark
 
 #: Rows that take little time.
 FEW = ("--per-object", 1, "--reference", "own", "--reference", "constant", "--quiet")
+
+
+@pytest.fixture
+def given(out: Path) -> tuple[object, ...]:
+    """Words of a score of one row of zeros."""
+    np.save(out.parent / "net.npy", np.zeros((1, 18)))
+    return "score", out.parent / "net.npy", "--dataset", out / OTO
 
 
 @pytest.mark.sim
@@ -74,7 +81,7 @@ def test_a_part_of_the_benchmark_is_built_and_all_of_it_tests(tmp_path: Path) ->
 
 
 def test_the_card_has_the_command_as_it_was_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    given: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without options that were not given, and with the folder, where the score continues."""
 
@@ -82,41 +89,31 @@ def test_the_card_has_the_command_as_it_was_given(
         raise GraspError(again)
 
     monkeypatch.setattr("drakegrasp.api.scoring.score", refuse)
-    data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
-    np.save(tmp_path / "net.npy", np.zeros((1, 18)))
-    words = [
-        "score",
-        tmp_path / "net.npy",
-        "--dataset",
-        data,
-        "--out",
-        tmp_path / "by 1",
-        *FEW[:-1],
-    ]
+    words = [*given, "--out", tmp_path / "by 1", *FEW[:-1]]
     said = error_line(run(*words, "--workers", 1, "--quiet"))
-    given = shlex.split(said.partition("drakegrasp ")[2])
-    assert sorted(given) == sorted(map(str, words))
+    found = shlex.split(said.partition("drakegrasp ")[2])
+    assert sorted(found) == sorted(map(str, words))
 
 
 @pytest.mark.parametrize(
     ("ends", "said"), [((0.125, 0.5), "(12.5 to 50.0)"), ((0.25, 0.25), "(no interval)")]
 )
 def test_shares_and_their_intervals_are_printed_as_percent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: tuple[float, float], said: str
+    given: tuple[object, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    ends: tuple[float, float],
+    said: str,
 ) -> None:
     """The interval of one object is none."""
     share = {"value": 0.25, "low": ends[0], "high": ends[1]}
     scored = SimpleNamespace(card={"headline": {"net.npy": share}})
     monkeypatch.setattr("drakegrasp.api.scoring.score", lambda *_, **__: scored)
-    data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
-    np.save(tmp_path / "net.npy", np.zeros((1, 18)))
-    words = ("score", tmp_path / "net.npy", "--dataset", data)
-    result = run(*words, "--workers", 1, "--quiet")
+    result = run(*given, "--workers", 1, "--quiet")
     assert result.stdout == f"net.npy: 25.0 % {said}\n"
 
 
 def test_the_share_of_clean_grasps_is_printed_beside_the_headline(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If the card has it, as among other objects."""
     some, none = {"value": 0.5, "low": 0.25, "high": 0.75}, {"value": 0.0, "low": 0.0, "high": 0.0}
@@ -126,17 +123,15 @@ def test_the_share_of_clean_grasps_is_printed_beside_the_headline(
     }
     scored = SimpleNamespace(card={"headline": {}, "sets": sets, "warnings": []})
     monkeypatch.setattr("drakegrasp.api.scoring.score", lambda *_, **__: scored)
-    data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
-    assert run("score", "--dataset", data, "--workers", 1).stderr == (
+    assert run("score", "--dataset", out / OTO, "--workers", 1).stderr == (
         "own: 50.0 % (25.0 to 75.0), clean 0.0 % (no interval)\nconstant: 0.0 % (no interval)\n"
     )
 
 
 @pytest.mark.sim
 def test_without_a_folder_nothing_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes")
     before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     words = ("--dataset", out / OTO, "--per-object", 1, "--reference", "constant")
@@ -146,12 +141,11 @@ def test_without_a_folder_nothing_is_written(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_mistakes_are_one_line(tmp_path: Path) -> None:
-    data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
-    np.save(tmp_path / "short.npy", np.zeros((1, 18)))
+def test_mistakes_are_one_line(given: tuple[object, ...], out: Path) -> None:
+    wrong = ("score", "--reference", "magic", "--dataset", out / OTO)
     for words, said in (
-        ([tmp_path / "short.npy"], "without rows there must be a grasp for each of the"),
-        (["--reference", "magic"], "references must be of own, nearest image,"),
+        (given, "without rows there must be a grasp for each of the"),
+        (wrong, "references must be of own, nearest image,"),
     ):
-        result = run("score", *words, "--dataset", data)
+        result = run(*words)
         assert (result.exit_code, said in error_line(result)) == (2, True)

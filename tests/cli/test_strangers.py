@@ -14,9 +14,11 @@ import trimesh
 from helpers.commands import run
 from helpers.datasets import OTO, TRIALS, edit_manifest
 
+from drakegrasp import foreign_files
 from drakegrasp.api.building import build_dataset
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
+from drakegrasp.foreign_files import validate_regular
 from drakegrasp.page.gallery import TEMPLATES
 from drakegrasp.runtime.environment import host_label
 
@@ -204,3 +206,25 @@ def test_paths_and_names_of_files_do_not_steer_the_terminal(tmp_path: Path) -> N
 def test_names_on_a_page_steer_nothing() -> None:
     page = TEMPLATES.from_string("<p>{{ name }}</p>").render(name=f"<é{STEERING}>")
     assert page == "<p>&lt;é\\x1b]0;x\\x07\\x9b31m&gt;</p>"
+
+
+# Sparse files
+
+
+def test_share_of_a_file_that_is_on_the_disk_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of a large one must be: 300 kB of 1 MB are too few, 900 kB are enough."""
+    monkeypatch.setattr(foreign_files, "SOLID", 0.5)
+    path = tmp_path / "file"
+    path.write_bytes(b"x" * 300_000)
+    os.truncate(path, 1_000_000)
+    validate_regular(path)
+    monkeypatch.setattr(foreign_files, "LARGE", 2**10)
+    with pytest.raises(OSError, match=r"1,000,000 byte, of which only 3\d\d,\d{3} are on"):
+        validate_regular(path)
+    path.write_bytes(b"x" * 900_000)
+    os.truncate(path, 1_000_000)
+    validate_regular(path)
+    with pytest.raises(OSError, match="1,000,000 byte, more than 1,024"):
+        validate_regular(path, 2**10)

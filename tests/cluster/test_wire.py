@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import filecmp
 import os
 import pickle
 import signal
@@ -17,6 +16,7 @@ import h5py
 import pytest
 import trimesh
 from distributed import Client, Worker
+from helpers.assertions import contents
 from helpers.builds import FAST, build
 from helpers.file_tasks import Join, join
 from helpers.tiers import in_second_tier
@@ -68,17 +68,6 @@ def put(out: Path, count: int) -> None:
     (out / "in/common").write_text("common")
     for number in range(count):
         (out / f"in/{number}").write_text(str(number))
-
-
-def assert_same_files(a: Path, b: Path) -> None:
-    """Two datasets have the same files, byte for byte."""
-    assert names_in(a) == names_in(b)
-    _, other, _ = filecmp.cmpfiles(a, b, names_in(a), shallow=False)
-    assert other == []
-
-
-def names_in(folder: Path) -> set[str]:
-    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
@@ -217,7 +206,7 @@ def test_every_kind_of_task_gives_the_same_bytes(
     build(meshes, here, config)
     with by_wire(DaskExecutor(client), client, out) as execute:
         build(meshes, out, config, execute, pool=WorkerPool())
-    assert_same_files(here, out)
+    assert contents(here) == contents(out)
     with h5py.File(out / "trials.hdf5") as file:
         assert file["trials/outcome"][0] == Outcome.SUCCESS
 

@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from helpers.assertions import arrays_of
+from helpers.assertions import arrays_of, contents
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 from helpers.shards import read_shard
 
@@ -25,7 +25,6 @@ from drakegrasp.dataset.rejections import (
     AttemptKey,
     Decisions,
     read_decisions,
-    unused_rejections,
     write_decisions,
 )
 from drakegrasp.dataset.schema import CAMERAS
@@ -252,10 +251,10 @@ def test_filters_that_lifts_were_ended_by_cannot_be_looser(tmp_path: Path, overr
     out = make_dataset(
         tmp_path / "out", tmp_path / "meshes", overrides=["lift.stop_when=lost_sample"]
     )
-    before = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    before = contents(out)
     with pytest.raises(ConfigError, match=rf"{override.partition('=')[0]} must be"):
         assemble(out, overrides=[override])
-    assert {path: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+    assert contents(out) == before
     assert assemble(out, overrides=["filters.max_slip=0.009"]).samples
 
 
@@ -361,30 +360,3 @@ def test_a_decision_replaces_the_one_before() -> None:
     assert rejected.of(B) == ""
     with pytest.raises(ValueError, match="decision must be rejected, kept or empty, got 'no'"):
         rejected.with_decision(A, "no")
-
-
-def test_keys_that_are_no_success_are_left_out(out: Path) -> None:
-    """Of a failure, and of an object that is gone: the others count."""
-    failure, gone = AttemptKey("1_box_a", 0, 1), AttemptKey("0_gone", 0, 0)
-    path = out / "reject.json"
-    write_decisions(path, Decisions(rejected=frozenset([A, failure, gone])))
-    given = sorted(read_decisions(path).rejected)
-    assert assemble(out, rejected=given).removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
-    used = read_manifest(out).rejected
-    assert used == (A,)
-    (sentence,) = unused_rejections(out, given, used)
-    assert sentence.startswith("skipped 2 of 3 rejections")
-    assert "0_gone, palm pose 0, stand-off 0; 1_box_a, palm pose 0, stand-off 1" in sentence
-
-
-def test_rejections_that_nobody_asked_for_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "reject.json"
-    write_decisions(path, Decisions(rejected=frozenset([A, B])))
-    for given in ([], [0]):
-        (sentence,) = unused_rejections(tmp_path, given, [A])
-        assert "not used: 1; --reject" in sentence
-    assert unused_rejections(tmp_path, [A, B], [A, B]) == []
-    assert unused_rejections(tmp_path, [], [A, B]) == []
-    # A file that cannot be read is no matter of an assembly that does not use it.
-    path.write_text("broken")
-    assert unused_rejections(tmp_path, [], []) == []

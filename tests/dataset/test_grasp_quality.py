@@ -8,12 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from drakegrasp.dataset.quality import (
-    CAP,
-    COLUMNS,
-    PARTS,
-    anomaly,
-)
+from drakegrasp.dataset.quality import CAP, COLUMNS, PARTS, anomaly
 from drakegrasp.frames import GRAVITY, make_pose, pack_pose, rotation_about
 from drakegrasp.outcomes import Outcome
 
@@ -66,16 +61,6 @@ def test_a_firm_grasp_is_not_anomalous() -> None:
     assert set(COLUMNS) == set(firm())
     np.testing.assert_allclose(found.score, 0.0, atol=1e-12)
     assert list(found.values) == list(found.shares) or set(found.values) == set(found.shares)
-
-
-def test_a_fingertip_that_does_not_touch_has_no_contact_to_doubt() -> None:
-    """The third finger is optional; the other two oppose each other."""
-    columns = firm()
-    columns["closed_touching"][:, 2] = False
-    for name in ("normal_angle", "surface_distance"):
-        columns[name][:, 2] = np.nan
-    columns["closed_nhat_Q_O"][:] = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [np.nan] * 3]
-    np.testing.assert_allclose(anomaly(columns).score, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -142,12 +127,18 @@ def test_a_success_without_a_normal_is_most_anomalous_by_it() -> None:
     assert found.score[1] == pytest.approx(np.sqrt(2.0) * CAP)
 
 
-def test_normals_are_of_the_fingers_that_a_preshape_uses() -> None:
-    columns = firm()
-    columns["closed_nhat_Q_O"][:] = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [np.nan] * 3]
+def test_a_fingertip_that_does_not_touch_counts_unless_the_preshape_leaves_it_out() -> None:
+    """It has no contact to doubt. The other two oppose each other, and then push the same way."""
+    columns, x = firm(3), [1.0, 0.0, 0.0]
     columns["closed_touching"][:, 2] = False
-    columns["unused"][1] = 0b100
-    np.testing.assert_allclose(anomaly(columns).values["normal_sum"], [2.0 / 3.0, 1.0])
+    for name in ("normal_angle", "surface_distance"):
+        columns[name][:, 2] = np.nan
+    columns["closed_nhat_Q_O"][:] = [x, x, [np.nan] * 3]
+    columns["closed_nhat_Q_O"][0, 1] *= -1.0
+    columns["unused"][2] = 0b100
+    found = anomaly(columns)
+    np.testing.assert_allclose(found.values["normal_sum"], [0.0, 2.0 / 3.0, 1.0], atol=1e-12)
+    assert found.score[0] == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("fingers", [2, 3, 4])

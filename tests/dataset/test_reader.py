@@ -243,20 +243,6 @@ def test_images_inflated_here_are_those_of_hdf5(
             monkeypatch.undo()
 
 
-def test_a_damaged_image_is_no_image(tmp_path: Path) -> None:
-    """Neither of HDF5 nor of libdeflate: both verify a checksum."""
-    field = DATA_FIELDS[0]
-    with h5py.File(tmp_path / "images.hdf5", "w") as file:
-        dataset = create_field(file, field, field.row_shape(LETTERS))
-        dataset.resize(2, axis=0)
-        dataset[0] = np.random.default_rng(0).random(dataset.shape[1:])
-        mask, chunk = dataset.id.read_direct_chunk((0, 0, 0, 0))
-        for content in (chunk[:-1] + bytes([chunk[-1] ^ 1]), chunk[:50]):
-            dataset.id.write_direct_chunk((0, 0, 0, 0), content, mask)
-            with pytest.raises(OSError):
-                ImageRows(dataset)[0]
-
-
 def test_files_that_are_packed_otherwise_are_read_by_hdf5(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,7 +22,6 @@ from drakegrasp.dataset.schema import (
     TRIAL_FIELDS,
     VERIFICATION_FIELDS,
     Field,
-    sizes,
 )
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import DataError
@@ -30,23 +29,6 @@ from drakegrasp.generation.replay import replay_trial
 from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Stage
 from drakegrasp.simulation.contacts import Contacts
-
-SIZES = sizes(fingers=3, joints=4, image=8)
-
-
-def test_letters_of_a_shape_become_lengths() -> None:
-    for shape, axes, row in (
-        ("", (), ()),
-        ("k 3", ("k", 3), (3, 3)),
-        ("6k", ("6k",), (18,)),
-        ("4 S S", (4, "S", "S"), (4, 8, 8)),
-        ("j", ("j",), (4,)),
-    ):
-        field = Field("name", "float64", "nothing", shape, "m", "O")
-        assert (field.axes, field.row_shape(SIZES)) == (axes, row)
-        values = field.empty(2, SIZES)
-        assert values.shape == (2, *row)
-        assert np.isnan(values).all()
 
 
 def test_contact_fields_are_those_that_the_simulation_reads() -> None:

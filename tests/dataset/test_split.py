@@ -10,12 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.split import (
-    SPLIT_NAMES,
-    Home,
-    find_homes,
-    split_samples,
-)
+from drakegrasp.dataset.split import SPLIT_NAMES, Home, find_homes, split_samples
 
 BY_CLASS = SplitConfig(by="class")
 NAMES = ["a1", "a2", "a3", "b1", "c1", "c2"]

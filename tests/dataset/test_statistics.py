@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 from helpers.datasets import SUCCESS, TRIALS, change, make_dataset
 
-from drakegrasp.cli.tables import approach_line, funnel_table
+from drakegrasp.cli.tables import approach_line, funnel_table, print_stats
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.statistics import (
-    count_funnel,
-    counts_as_dict,
-)
+from drakegrasp.dataset.schema import NOT_TRIED
+from drakegrasp.dataset.statistics import Funnel, count_funnel, counts_as_dict
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.filters import Removal
 from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
 from drakegrasp.outcomes import Outcome
+from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 
 
 def test_removals_are_counted_by_object(out: Path) -> None:
@@ -87,19 +90,116 @@ def test_samples_that_are_distinct_are_counted(out: Path) -> None:
     assert count_funnel(out).distinct[0] == 3
 
 
-def test_splits_are_counted(out: Path) -> None:
-    """By object each has one; by class the only one of a class is tested, and one of two others."""
-    assert [(c.samples, c.objects, c.classes) for c in count_funnel(out).splits] == 3 * [(3, 1, 1)]
-    assemble(out, overrides=["split.by=class"])
-    counts = {c.split: (c.samples, c.objects, c.classes) for c in count_funnel(out).splits}
-    assert counts["test"] == (6, 2, 2)
-    assert counts["train"][0] + counts["valid"][0] == 3
-    assert counts["train"][1:] == counts["valid"][1:] == (1, 1)
-
-
 def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
     """Two objects of three are boxes, and all three train."""
     shares = ("split.by=object", "split.test_fraction=0", "split.valid_fraction=0")
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", overrides=shares)
     (train,) = (count for count in count_funnel(out).splits if count.split == "train")
     assert (train.samples, train.objects, train.classes) == (9, 3, 2)
+
+
+# Grasps among other objects are counted alike by stats and figures
+
+
+#: Labels of grasps among others, besides whether they were tried.
+LABELS = ("free", "kept", "clean")
+
+
+@pytest.mark.sim
+def test_grasps_among_others_are_counted_by_surroundings(
+    small_clutter: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In text, as JSON and in the figures."""
+    with h5py.File(small_clutter / "clutter.hdf5") as file:
+        around = file["scenes/surroundings"].asstr()[:]
+        grasps = {name: file["grasps"][name][:] for name in ("scene", "outcome", *LABELS)}
+    tried = grasps["outcome"] != NOT_TRIED
+    due = []
+    for name in ("bin", "table"):
+        own = (around == name)[grasps["scene"]]
+        due.append(
+            {
+                "surroundings": name,
+                "scenes": int((around == name).sum()),
+                "grasps": int(own.sum()),
+                "tried": int((own & tried).sum()),
+                "neighbour_hit": int((own & (grasps["outcome"] == 19)).sum()),
+                **{label: int((own & grasps[label]).sum()) for label in LABELS},
+            }
+        )
+    assert due[1]["grasps"] > due[1]["free"] >= due[1]["tried"] > due[1]["kept"] > 0
+
+    assert counts_as_dict(small_clutter)["clutter"] == due
+    written = write_figures(small_clutter, tmp_path)
+    numbers = json.loads((tmp_path / NUMBERS_FILE).read_text())
+    assert numbers["clutter"] == due and numbers["scenes"] == {"scenes": [0, 1, 2]}
+    assert {"clutter", "scenes"} <= set(written.names) and (tmp_path / "scenes.png").is_file()
+    print_stats(small_clutter)
+    told = capsys.readouterr().out
+    for each in due:
+        free, tried, kept = each["free"], each["tried"], each["kept"]
+        assert f"({each['surroundings']}): {free} of {each['grasps']} grasps free" in told
+        assert f"of {tried} tried {kept} kept, {each['clean']} clean" in told
+
+
+@pytest.mark.sim
+def test_scenes_of_other_trials_are_not_counted(
+    small_clutter: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The files were assembled again since: the rest is counted and drawn."""
+    out = Path(shutil.copytree(small_clutter, tmp_path / "out"))
+    write_figures(out, out / "figures")
+    assemble(out, rejected=Trials(out).where(kept=True).trial_ids.tolist()[:1])
+    print_stats(out)
+    why = "must be of the trials in its folder, got other scenes; run `drakegrasp clutter` again"
+    assert f"not counted: {out / 'clutter.hdf5'}: {why}" in capsys.readouterr().out
+    left_out = write_figures(out, out / "figures").left_out
+    assert set(left_out) == {"clutter", "scenes"} and why in left_out["clutter"]
+    assert not (out / "figures/scenes.png").exists()
+
+
+# The table of the funnel
+
+
+def cells(funnel: Funnel) -> dict[str, str]:
+    """Return the row of the first object by the heads of the columns."""
+    columns = funnel_table(funnel).columns
+    return {
+        str(column.header).replace("\n", " "): str(next(iter(column.cells))) for column in columns
+    }
+
+
+def test_columns_of_the_funnel_add_up_to_the_attempts() -> None:
+    """Each outcome of a build is in one column: here each has another power of two attempts."""
+    built = [outcome for outcome in Outcome if not outcome.verification_only]
+    outcomes = np.zeros((1, 1 + max(Outcome)), dtype=np.int64)
+    outcomes[0, built] = 2 ** np.arange(len(built))
+    removals = np.zeros((1, 1 + max(Removal)), dtype=np.int64)
+    removals[0, [Removal.OTHER_LINKS, Removal.KEPT]] = 8, outcomes[0, Outcome.SUCCESS]
+    none = np.zeros(1, dtype=np.int64)
+    funnel = Funnel(
+        names=("2_[box]",),
+        classes=("box",),
+        candidates=none + 1200,
+        outcomes=outcomes,
+        precision=none + 12,
+        stable=none + 9,
+        removals=removals,
+        elevations=np.zeros((1, 3), dtype=np.int64),
+        approach_cells=none,
+        in_splits=np.zeros((1, 3), dtype=np.int64),
+        distinct_in_splits=np.zeros((1, 3), dtype=np.int64),
+    )
+    row = cells(funnel)
+    assert row["object"] == r"2_\[box]"  # rich prints it without the backslash
+    other = {"poses": "1,200", "precision": "12", "stable": "9", "- other links": "8"}
+    assert {name: row[name] for name in other} == other
+    counts = list(row)[3 : 3 + len(built)]
+    assert sorted(int(row[name].replace(",", "")) for name in counts) == [
+        2**k for k in range(len(built))
+    ]
+    assert row["attempts"] == f"{outcomes.sum():,}" and "moved" in counts
+
+    # Without one there is no column of lifts that were ended.
+    outcomes[0, Outcome.MOVED] = 0
+    assert "moved" not in cells(funnel)

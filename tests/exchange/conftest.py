@@ -9,12 +9,7 @@ from pathlib import Path
 import pytest
 from helpers.datasets import make_dataset
 
-from drakegrasp.exchange.export import (
-    ClosedGrasp,
-    export_dataset,
-    options_of,
-    read_closed_grasps,
-)
+from drakegrasp.exchange.export import ClosedGrasp, export_dataset, options_of, read_closed_grasps
 
 
 @pytest.fixture(scope="session")

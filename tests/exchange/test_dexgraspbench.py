@@ -1,8 +1,9 @@
-"""The files of DexGraspBench: a hand, objects and grasps that its loader reads."""
+"""What MuJoCo loads: the hand, objects and grasps of DexGraspBench, and posed scenes."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,18 +19,11 @@ mujoco = pytest.importorskip("mujoco")
 
 from drakegrasp.exchange.dexgraspbench import APART, grasp_dictionary  # noqa: E402
 from drakegrasp.exchange.export import ClosedGrasp  # noqa: E402
-from drakegrasp.frames import Array, multiply  # noqa: E402
+from drakegrasp.frames import invert_pose, multiply  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.hand.kinematics import fingertip_poses  # noqa: E402
 from drakegrasp.mjcf import make_hand_model  # noqa: E402
 from drakegrasp.pictures.still_scene import StillScene  # noqa: E402
-
-
-def pose_of(vector: Array) -> Array:
-    """Return the pose (4, 4) of a position and a quaternion w, x, y, z, as other tools read it."""
-    X = trimesh.transformations.quaternion_matrix(vector[3:])
-    X[:3, 3] = vector[:3]
-    return X
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +89,13 @@ def test_hand_is_one_model_with_fingertips_where_drake_has_them(
         np.testing.assert_allclose(data.body(link).xpos, p_WF, atol=1e-6)
 
 
-def test_motors_have_the_gains_of_the_benchmark(folder: Path, settings: dict[str, Any]) -> None:
+def test_model_has_the_links_of_the_settings_and_the_gains_of_the_benchmark(
+    folder: Path, settings: dict[str, Any]
+) -> None:
     model = mujoco.MjModel.from_xml_path(str(folder / settings["xml_path"]))
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    assert set(settings["valid_body_name"]) <= bodies
+    assert settings["tip_body_name"] == list(load_hand().fingertip_links)
     assert model.nu == 5
     # The benchmark's MuJoCo does not know the attribute by which newer ones write a position.
     assert "input=" not in (folder / settings["xml_path"]).read_text()
@@ -121,13 +120,6 @@ def test_hand_has_the_friction_of_mujocos_defaults() -> None:
         assert set(model.compile().geom_friction[:, 0]) == {friction}
 
 
-def test_settings_name_links_of_the_model(folder: Path, settings: dict[str, Any]) -> None:
-    model = mujoco.MjModel.from_xml_path(str(folder / settings["xml_path"]))
-    bodies = {model.body(i).name for i in range(model.nbody)}
-    assert set(settings["valid_body_name"]) <= bodies
-    assert settings["tip_body_name"] == list(load_hand().fingertip_links)
-
-
 def test_objects_have_their_volume(folder: Path, grasps: list[ClosedGrasp]) -> None:
     """From it the benchmark has the density that makes every object as heavy."""
     for grasp in grasps:
@@ -139,3 +131,52 @@ def test_objects_have_their_volume(folder: Path, grasps: list[ClosedGrasp]) -> N
         # The boxes of the dataset lie on the table with their centre as origin.
         lowest = min((part.vertices @ grasp.X_TO[2, :3]).min() for part in parts)
         assert lowest == pytest.approx(-grasp.X_TO[2, 3], abs=1e-3)
+
+
+# Posed scenes for MuJoCo
+
+
+def test_each_scene_has_object_and_links_where_they_were(
+    exported: Callable[[str], Path], grasps: list[ClosedGrasp], tmp_path: Path
+) -> None:
+    """Also from another folder: meshes are found beside the scenes."""
+    folder = tmp_path / "moved & renamed"
+    shutil.copytree(exported("mjcf"), folder)
+    assert len(list(folder.glob("*/*.xml"))) == len(grasps)
+    hand = load_hand()
+    posed = StillScene(hand)
+    for grasp in grasps:
+        path = folder / grasp.object_name / f"{grasp.trial_id}.xml"
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, model.key("grasp").id)
+        mujoco.mj_kinematics(model, data)
+
+        np.testing.assert_allclose(data.body("object").xpos, grasp.X_TO[:3, 3], atol=1e-6)
+        posed.pose(grasp.X_TG, grasp.q)
+        X_TP = posed.link_pose(hand.palm_link)
+        np.testing.assert_allclose(X_TP, grasp.X_TG @ invert_pose(hand.X_BG), atol=1e-9)
+        for link in hand.link_chains:
+            found = data.body(f"hand/{link}")
+            np.testing.assert_allclose(found.xpos, posed.link_pose(link)[:3, 3], atol=1e-6)
+
+
+@pytest.fixture
+def model(exported: Callable[[str], Path], grasps: list[ClosedGrasp]) -> Any:
+    path = exported("mjcf") / grasps[0].object_name / f"{grasps[0].trial_id}.xml"
+    return mujoco.MjModel.from_xml_path(str(path))
+
+
+def test_motors_keep_the_fingers_where_they_are(model: Any) -> None:
+    joints = model.actuator_trnid[:, 0]
+    at = model.key_qpos[0][model.jnt_qposadr[joints]]
+    np.testing.assert_allclose(model.key_ctrl[0], at)
+    assert model.body("object").mass[0] == pytest.approx(1.0)
+
+
+def test_object_touches_with_its_convex_parts(model: Any, grasps: list[ClosedGrasp]) -> None:
+    # A box is one part, with its own edges.
+    (part,) = np.flatnonzero(model.geom_bodyid == model.body("object").id)
+    np.testing.assert_allclose(model.geom_aabb[part], [0.0, 0.0, 0.0, 0.025, 0.03, 0.05], atol=1e-7)
+    np.testing.assert_allclose(model.geom_friction[part, 0], grasps[0].conditions[0])
+    assert model.geom_condim[part] == 4

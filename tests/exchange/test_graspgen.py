@@ -11,10 +11,9 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-import yaml
 from helpers.commands import run
 from helpers.datasets import OTO
-from scipy.spatial.transform import Rotation
+from helpers.isaac import isaac_grasp, write_isaac
 
 from drakegrasp.cli.arguments import Postures
 from drakegrasp.cli.verify import Target, place
@@ -138,26 +137,14 @@ def write_box(folder: Path) -> None:
     mesh.export(folder / "box.obj")
 
 
-def write_graspgen(path: Path, poses: list[np.ndarray], confidence: list[float]) -> Path:
-    """A file as `save_to_isaac_grasp_format` of GraspGen writes it."""
-    grasps = {}
-    for i, (X, stated) in enumerate(zip(poses, confidence, strict=True)):
-        w, *xyz = Rotation.from_matrix(X[:3, :3]).as_quat(scalar_first=True).tolist()
-        turn = {"w": w, "xyz": xyz}
-        place = {"position": X[:3, 3].tolist(), "orientation": turn}
-        grasps[f"grasp_{i}"] = {"confidence": stated, **place}
-    tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": grasps}
-    path.write_text(yaml.dump(tree, default_flow_style=False, sort_keys=False))
-    return path
-
-
 @pytest.mark.sim
 def test_graspgen_is_verified_on_a_mesh_in_centimetres(tmp_path, monkeypatch):
     """With its frame named the first grasp holds; turned about x it faces away."""
     monkeypatch.chdir(tmp_path)
     write_box(tmp_path)
     turned = X_ABOVE @ make_pose(rotation_about([1.0, 0.0, 0.0], np.pi), np.zeros(3))
-    write_graspgen(tmp_path / "box.yaml", [X_ABOVE, turned], [0.9, 0.8])
+    first, second = isaac_grasp(X_ABOVE, confidence=0.9), isaac_grasp(turned, confidence=0.8)
+    write_isaac(tmp_path / "box.yaml", grasp_0=first, grasp_1=second)
     done = run("verify", "box.yaml", *ON_BOX, "--link", "graspgen", "--workers", "1")
     assert done.exit_code == 0, done.stderr
     verdicts = [json.loads(line) for line in done.stdout.splitlines()]
@@ -182,8 +169,6 @@ def test_the_caller_says_the_preshape_of_rows_that_name_none(tmp_path):
 @pytest.mark.sim
 @pytest.mark.usefixtures("builds_here")
 def test_palm_poses_are_built_in_each_preshape_and_a_third_resting_pose(tmp_path, monkeypatch):
-    import h5py
-
     monkeypatch.chdir(tmp_path)
     (tmp_path / "meshes").mkdir()
     write_box(tmp_path / "meshes")

@@ -106,7 +106,7 @@ def test_files_say_what_the_posture_says(tmp_path: Path, grasps: list[ClosedGras
     assert (content["pregrasp_qpos"][7:] <= content["grasp_qpos"][7:]).all()
 
 
-def test_the_parts_of_an_object_are_cut_once(
+def test_the_parts_of_an_object_are_cut_once_unless_their_file_is_damaged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = box_model(tmp_path, [0.06] * 3)
@@ -118,31 +118,22 @@ def test_the_parts_of_an_object_are_cut_once(
         assert all(np.array_equal(a, b) for a, b in zip(parts, found, strict=True))
     assert cut == [model]
 
+    # Half a file, none, and one without a part.
+    (path,) = (tmp_path / "keep").iterdir()
+    content = path.read_bytes()
+    np.savez(tmp_path / "empty.npz")
+    for damaged in (content[:100], b"", (tmp_path / "empty.npz").read_bytes()):
+        path.write_bytes(damaged)
+        mjcf.kept_convex_parts(model, tmp_path / "keep")
+        assert path.read_bytes() == content
+    cut.clear()
+
     # Another object, and other rules.
     other = replace(model, collision_faces=model.collision_faces[::-1].copy())
     mjcf.kept_convex_parts(other, tmp_path / "keep")
     monkeypatch.setitem(mjcf.SETTINGS, "threshold", 0.03)
     mjcf.kept_convex_parts(other, tmp_path / "keep")
-    assert cut == [model, other, other]
-
-
-DAMAGE: dict[str, Callable[[Path], None]] = {
-    "half": lambda path: path.write_bytes(path.read_bytes()[:100]) and None,
-    "nothing": lambda path: path.write_bytes(b"") and None,
-    "no part": lambda path: np.savez(path),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_file_of_parts_is_written_again(damage: str, tmp_path: Path) -> None:
-    model, keep = box_model(tmp_path, [0.06] * 3), tmp_path / "keep"
-    parts = mjcf.kept_convex_parts(model, keep)
-    (path,) = keep.iterdir()
-    content = path.read_bytes()
-    DAMAGE[damage](path)
-    again = mjcf.kept_convex_parts(model, keep)
-    assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
-    assert path.read_bytes() == content
+    assert cut == [other, other]
 
 
 def test_workers_fit_and_cut_in_any_order(closed: tuple[Path, TrialRecord], tmp_path: Path) -> None:

@@ -12,6 +12,12 @@ import pytest
 from drakegrasp.errors import DrakegraspError, GraspError
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of all files below a folder by their paths in it."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
     """Return every dataset of an HDF5 file by its path."""
     found: dict[str, np.ndarray] = {}

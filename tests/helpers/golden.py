@@ -60,20 +60,17 @@ def _near(expected: str | None, found: str | None) -> bool:
 # Figures.
 
 
-def drawn(figure: Figure, *, pixels: bool = True) -> str:
-    """Return what a figure shows: positions, limits, words, and the data of all marks.
-
-    Without `pixels`, images are described by their size alone: those that OpenGL rendered.
-    """
+def drawn(figure: Figure) -> str:
+    """Return what a figure shows: positions, limits, words, and the data of all marks."""
     lines = [f"figure {_list(figure.get_size_inches())}", *_texts(figure.texts, "")]
     for legend in figure.legends:
         lines += _legend(legend, "")
     for axes in figure.axes:
-        lines += _axes(axes, pixels)
+        lines += _axes(axes)
     return "\n".join(lines)
 
 
-def _axes(axes: Axes, pixels: bool) -> Iterator[str]:
+def _axes(axes: Axes) -> Iterator[str]:
     limits = f"x {_list(axes.get_xlim())} y {_list(axes.get_ylim())}"
     yield f"axes {_list(axes.get_position().bounds)} {limits}"
     words = (axes.get_title(), axes.get_xlabel(), axes.get_ylabel())
@@ -97,8 +94,8 @@ def _axes(axes: Axes, pixels: bool) -> Iterator[str]:
         yield f"  {type(found).__name__} {len(corners)} {list(map(to_hex, colours))} {places}"
     for image in axes.images:
         values = np.asarray(image.get_array())
-        content = points(values.reshape(-1, values.shape[-1])) if pixels else ""
-        yield f"  image {values.shape} {_list(image.get_extent())} {content}".rstrip()
+        content = points(values.reshape(-1, values.shape[-1]))
+        yield f"  image {values.shape} {_list(image.get_extent())} {content}"
 
 
 def _texts(texts: Iterable[Text], indent: str) -> Iterator[str]:

@@ -77,6 +77,12 @@ def surface_of(content: bytes | str) -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
+def scene_in(page: str) -> dict[str, Any]:
+    """Return the scene that the 3D view of a page shows."""
+    (text,) = re.findall(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
+    return dict(json.loads(text)["scene"])
+
+
 class Tags(HTMLParser):
     """The tags of a page with their attributes, and its text."""
 

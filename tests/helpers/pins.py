@@ -244,13 +244,6 @@ def calls(out: Path, split: str) -> Pins:
     return found | {f"calls/posture/{k}": np.asarray(v) for k, v in told.items()}
 
 
-def differences(found: dict[str, str], expected: dict[str, str]) -> list[str]:
-    """Return a line for each name that differs or is gone; what is new has changed nothing."""
-    lines = [f"gone: {name}" for name in expected.keys() - found.keys()]
-    both = found.keys() & expected.keys()
-    return sorted(lines + [f"differs: {name}" for name in both if found[name] != expected[name]])
-
-
 def summaries(found: Pins) -> Pins:
     """Return what arrays are compared by on other machines: images by means, empty ones not."""
     return {name: _summary(value) for name, value in found.items() if value.size}
@@ -279,7 +272,10 @@ def read_values(path: Path) -> Pins:
 
 
 def far(found: Pins, expected: Pins) -> list[str]:
-    """Return a line for each summary that differs by more than another CPU's rounding."""
+    """Return a line for each summary that is gone or differs by more than another CPU's rounding.
+
+    What is new has changed nothing.
+    """
 
     def same(ours: np.ndarray, theirs: np.ndarray) -> bool:
         if ours.shape != theirs.shape or ours.dtype.kind != theirs.dtype.kind:
@@ -288,12 +284,9 @@ def far(found: Pins, expected: Pins) -> list[str]:
             return np.array_equal(ours, theirs)
         return np.allclose(ours, theirs, rtol=NEAR, atol=NEAR, equal_nan=True)
 
-    marks = {name: "same" for name in expected}
-    ours = {
-        name: "same" if name in expected and same(value, expected[name]) else "other"
-        for name, value in found.items()
-    }
-    return differences(ours, marks)
+    lines = [f"gone: {name}" for name in expected.keys() - found.keys()]
+    both = found.keys() & expected.keys()
+    return sorted(lines + [f"differs: {n}" for n in both if not same(found[n], expected[n])])
 
 
 if __name__ == "__main__":

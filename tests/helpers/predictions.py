@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -41,17 +40,12 @@ def write_predictions(out: Path, path: Path) -> Path:
                 columns[name][i] = true[name][i]
             columns["contact_error"][i] = [error, 0.0, 0.0]
     for name in ("lifted", "matches", "lifted_any"):
-        if name in columns:
-            columns[name][:] = columns["outcome"] == Outcome.SUCCESS
+        columns[name][:] = columns["outcome"] == Outcome.SUCCESS
     columns["precision"][:] = [True, False, False, False]
-    _write(path, columns, rows)
-    return path
-
-
-def _write(path: Path, columns: dict[str, Any], rows: PredictedRows) -> None:
     with h5py.File(path, "w") as file:
         file.attrs["schema_version"] = SCHEMA_VERSION
         group = file.create_group("grasps")
         for field in VERIFICATION_FIELDS:
             write_field(group, field, columns[field.name])
         rows.write(file)
+    return path

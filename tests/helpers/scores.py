@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from drakegrasp.scoring.measures import Grouping, Judged
-from drakegrasp.scoring.verdict import Verdict, rank_array, verdict_of
+from drakegrasp.scoring.verdict import Verdict, rank_array
 from drakegrasp.simulation.attempts import GraspRows
 
 FAILS = Verdict(
@@ -101,19 +101,5 @@ class FakeVerify:
                 raise KeyboardInterrupt
             self.asked += 1
             lifted = self.holds(grasp)
-            found: Any = SimpleNamespace(
-                grasp=SimpleNamespace(postures=()),
-                outcome=SimpleNamespace(label="success" if lifted else "dropped"),
-                matches=lifted,
-                lifted=lifted,
-                precision=lifted,
-                stable=lifted,
-                kept=lifted,
-                clean=lifted and self.leaves(grasp),
-                lifted_any=lifted,
-                first=None,
-                farthest_contact=0.001 if lifted else np.nan,
-                seconds={"simulate": 0.5},
-                reach=None,
-            )
-            on_result(index, verdict_of(found))
+            given = verdict("kept" if lifted else "fails", 0.001)
+            on_result(index, replace(given, clean=lifted and self.leaves(grasp)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.objects import box_model, from_above, standing
 
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, invert_pose, make_pose
@@ -32,25 +32,8 @@ pytestmark = pytest.mark.sim
 STANDOFF = 0.06
 
 
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE, CUBE, CUBE])
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def baseline(cube: ObjectModel, config: Config) -> MujocoBaseline:
-    return MujocoBaseline(cube, standing(cube), config)
-
-
-def test_cube_is_held_and_nothing_is_left_of_a_run(
-    baseline: MujocoBaseline, cube: ObjectModel
-) -> None:
-    attempt = from_above(cube, STANDOFF)
+def test_cube_is_held_and_nothing_is_left_of_a_run(cube: ObjectModel) -> None:
+    baseline, attempt = peer(cube), from_above(cube, STANDOFF)
     first, again = baseline.run(attempt), baseline.run(attempt)
     assert first.outcome is Outcome.SUCCESS and first.tried
     assert again == first
@@ -86,11 +69,9 @@ def test_friction_and_mass_of_an_attempt_are_those_of_a_model_built_with_them(
     assert found.run(attempt) == before != other
 
 
-def test_fingertips_are_where_kinematics_puts_them(
-    baseline: MujocoBaseline, cube: ObjectModel
-) -> None:
+def test_fingertips_are_where_kinematics_puts_them(cube: ObjectModel) -> None:
     """At 90 degrees of spread the fingers still have every joint of the hand's files."""
-    attempt = from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0)))
+    baseline, attempt = peer(cube), from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0)))
     baseline.run(attempt)
     m, d, hand = baseline._model, baseline._data, load_hand()
     mujoco.mj_kinematics(m, d)

@@ -9,6 +9,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
@@ -21,10 +22,7 @@ from helpers.pages import coded, numbered
 from helpers.predictions import write_predictions
 from matplotlib.image import imread
 
-from drakegrasp.dataset.rejections import (
-    AttemptKey,
-    read_decisions,
-)
+from drakegrasp.dataset.rejections import AttemptKey, read_decisions
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.generation.scenes import make_scenes
@@ -42,7 +40,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))
 OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 #: Longest wait for anything on a page [ms]; shared machines stall.
 PATIENCE = 60_000.0
-SIZES = {"wide": (1280, 900), "narrow": (390, 844)}
+SIZES = ((390, 844), (1280, 900))
 #: A page that is left before it has loaded gives up its requests, and one whose server has ended
 #: with its test may still ask for its icon.
 HARMLESS = ("GPU stall", "ABORTED", "CONNECTION_REFUSED")
@@ -90,24 +88,46 @@ def state(sound: Path) -> Snapshot:
 
 @pytest.fixture
 def address(out: Path) -> Iterator[str]:
-    yield from serve(out)
+    with served(out) as address:
+        yield address
 
 
-def serve(out: Path, results: Path | None = None) -> Iterator[str]:
-    """Serve a dataset from a thread, with results of predictions; yield its address."""
+@contextmanager
+def served(out: Path, results: Path | None = None) -> Iterator[str]:
+    """Serve a dataset from a thread, with results of predictions; yields its address."""
     listener = listen(0)
     config = uvicorn.Config(make_app(Inspection(out, results)), log_level="error")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
-    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-    server.should_exit = True
-    thread.join(timeout=30.0)
-    listener.close()
+    try:
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    finally:
+        server.should_exit = True
+        thread.join(timeout=30.0)
+        listener.close()
 
 
 def wait_for_view(page: Page) -> None:
     page.wait_for_selector("#view3d[data-ready]")
+
+
+def in_each_size(page: Page) -> Iterator[None]:
+    """Yield with each size of the window, in which what the page then shows must fit."""
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        yield
+        page.wait_for_load_state("networkidle")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def views(page: Page, *keys: str) -> int:
+    """Return how many different pictures the 3D view shows, at first and after each key."""
+    shots = {page.locator("#view3d").screenshot()}
+    for key in keys:
+        page.keyboard.press(key)
+        shots.add(page.locator("#view3d").screenshot())
+    return len(shots)
 
 
 def colours_of(page: Page) -> int:
@@ -175,22 +195,12 @@ def test_filters_act_when_chosen(page: Page, address: str, state: Snapshot) -> N
     assert page.input_value("select[name=object]") == ""
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_pages_fit_and_their_pictures_load(
-    page: Page, address: str, state: Snapshot, size: str
-) -> None:
-    width, height = SIZES[size]
-    page.set_viewport_size({"width": width, "height": height})
-    for name, path in (
-        ("gallery", "/"),
-        ("failures", "/?outcome=any&sort=row&order=up"),
-        ("grasp", coded(state, "/grasp/0-0-0")),
-    ):
-        page.goto(address + path)
-        if name == "grasp":
-            wait_for_view(page)
-        page.wait_for_load_state("networkidle")
-        assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+def test_pages_fit_and_their_pictures_load(page: Page, address: str, state: Snapshot) -> None:
+    for path in ("/", "/?outcome=any&sort=row&order=up", "/grasp/0-0-0"):
+        for _ in in_each_size(page):
+            page.goto(address + coded(state, path))
+            if path.startswith("/grasp"):
+                wait_for_view(page)
 
 
 def test_3d_view_draws_each_state(page: Page, address: str, state: Snapshot) -> None:
@@ -227,11 +237,7 @@ def test_keys_move_the_3d_view(page: Page, address: str, state: Snapshot) -> Non
     page.goto(coded(state, f"{address}/grasp/0-0-0"))
     wait_for_view(page)
     first = page.locator("#view3d").screenshot()
-    shots = {first}
-    for key in ("Shift+ArrowLeft", "Shift+ArrowUp", "+", "h", "f", "3"):
-        page.keyboard.press(key)
-        shots.add(page.locator("#view3d").screenshot())
-    assert len(shots) == 7
+    assert views(page, "Shift+ArrowLeft", "Shift+ArrowUp", "+", "h", "f", "3") == 7
     assert not page.is_checked("[data-layer=hand]")
     for key in ("h", "f", "2", "0"):
         page.keyboard.press(key)
@@ -278,9 +284,8 @@ def test_keyboard_moves_rejects_and_undoes(
 
 def test_a_server_that_has_ended_is_named(browser: Browser, out: Path, state: Snapshot) -> None:
     page = browser.new_page()
-    served = serve(out)
-    page.goto(next(served))
-    next(served, None)
+    with served(out) as address:
+        page.goto(address)
     page.click(coded(state, "[data-label='0-0-0'] [data-decide=rejected]"))
     page.wait_for_selector("#message:not([hidden])", timeout=PATIENCE)
     assert "does not answer" in page.inner_text("#message")
@@ -289,49 +294,40 @@ def test_a_server_that_has_ended_is_named(browser: Browser, out: Path, state: Sn
 
 def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> None:
     results = write_predictions(out, tmp_path / "run.h5")
-    for address in serve(out, results):
-        for width, height in SIZES.values():
-            page.set_viewport_size({"width": width, "height": height})
+    with served(out, results) as address:
+        for _ in in_each_size(page):
             page.goto(f"{address}/predictions")
-            page.wait_for_load_state("networkidle")
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-        page.set_viewport_size({"width": 1280, "height": 900})
         page.select_option("select[name=verdict]", "fails")
         wait_for_cards(page, 2)
         page.click("#cards li:nth-child(2) a")
         wait_for_view(page)
         assert "2 of 2" in page.inner_text(".position")
-        shots = {page.locator("#view3d").screenshot()}
-        for key in ("a", "c", "t"):
-            page.keyboard.press(key)
-            shots.add(page.locator("#view3d").screenshot())
-        assert len(shots) == 4
+        assert views(page, "a", "c", "t") == 4
         page.keyboard.press("g")
         page.wait_for_url("**/predictions?verdict=fails")
+
+
+def open_second(page: Page, address: str, gallery: str) -> None:
+    """Open a gallery and then the page of its second card, both of which must fit."""
+    for _ in in_each_size(page):
+        page.goto(address)
+        page.click(f"text={gallery}")
+    for _ in in_each_size(page):
+        page.goto(address)
+        page.click(f"text={gallery}")
+        page.click("#cards li:nth-child(2) a")
+        wait_for_view(page)
+    assert page.get_attribute("#view3d", "data-ready") == "yes"
 
 
 @pytest.mark.sim
 def test_scenes_filter_and_open(page: Page, out: Path) -> None:
     make_scenes(out, overrides=["scenes.views=3"])
-    for address in serve(out):
-        for width, height in SIZES.values():
-            page.set_viewport_size({"width": width, "height": height})
-            page.goto(address)
-            page.click("text=Scenes")
-            page.wait_for_load_state("networkidle")
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-            page.click("#cards li:nth-child(2) a")
-            wait_for_view(page)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-            assert "2 of 3" in page.inner_text(".position")
-        assert page.get_attribute("#view3d", "data-ready") == "yes"
+    with served(out) as address:
+        open_second(page, address, "Scenes")
+        assert "2 of 3" in page.inner_text(".position")
         # Palms, hands and the hand of another grasp are all drawn.
-        shots = {page.locator("#view3d").screenshot()}
-        for key in ("m", "2", "h", "m"):
-            page.keyboard.press(key)
-            shots.add(page.locator("#view3d").screenshot())
-        assert len(shots) == 5
-        page.set_viewport_size({"width": 1280, "height": 900})
+        assert views(page, "m", "2", "h", "m") == 5
         page.keyboard.press("g")
         page.wait_for_url("**/scenes")
         page.wait_for_load_state("networkidle")
@@ -377,24 +373,11 @@ CONTRAST = """() => {
 def test_scenes_of_several_objects_open(page: Page, out: Path) -> None:
     around = [load_surroundings("bin")]
     make_clutter(out, ClutterRequest(scenes=2, objects=(3, 3), surroundings=around, tries=1))
-    for address in serve(out):
-        for width, height in SIZES.values():
-            page.set_viewport_size({"width": width, "height": height})
-            page.goto(address)
-            page.click("text=Clutter")
-            page.wait_for_load_state("networkidle")
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-            page.click("#cards li:nth-child(2) a")
-            wait_for_view(page)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-        assert page.get_attribute("#view3d", "data-ready") == "yes"
+    with served(out) as address:
+        open_second(page, address, "Clutter")
         # The best hand is shown first; neighbours and walls can be hidden.
         assert page.get_attribute("#view3d", "data-state") == page.inner_text("button[data-state]")
-        shots = {page.locator("#view3d").screenshot()}
-        for key in ("r", "o"):
-            page.keyboard.press(key)
-            shots.add(page.locator("#view3d").screenshot())
-        assert len(shots) == 3
+        assert views(page, "r", "o") == 3
         for theme in ("light", "dark"):
             page.select_option("#theme", theme)
             contrast, text = page.evaluate(CONTRAST)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from helpers.datasets import TRIALS
-from helpers.pages import Tags, open_pages
+from helpers.pages import Tags, open_pages, scene_in
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
@@ -68,18 +65,12 @@ def test_a_palm_that_never_closed_is_shown_open(out: Path, results: Path) -> Non
         file["grasps/confidence"][:] = [0.3, 0.9, 0.5, 0.1]
     client = open_pages(out, results)
     assert shown(client, "sort=confidence") == ["1", "2", "0", "3"]
-    states = _scene(client.get("/prediction/2").text)["states"]
-    closed = _scene(client.get("/prediction/3").text)["states"]["closed"]
+    states = scene_in(client.get("/prediction/2").text)["states"]
+    closed = scene_in(client.get("/prediction/3").text)["states"]["closed"]
     assert set(states) == {"start", "dataset's grasp"}
     # The first link is the palm's.
     assert states["start"]["links"][0] == closed["links"][0]
     assert states["start"]["links"] != closed["links"]
-
-
-def _scene(page: str) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
-    assert found is not None
-    return dict(json.loads(found[1])["scene"])
 
 
 def test_without_results_there_are_no_predictions(out: Path) -> None:

@@ -41,14 +41,6 @@ def test_a_taken_port_is_one_line(sound: Path) -> None:
     assert result.stderr.startswith(f"error: --port must be free on this machine, got {port}")
 
 
-def test_a_directory_without_a_dataset_is_one_line(tmp_path: Path) -> None:
-    result = run("inspect", str(tmp_path / "none"))
-    assert result.exit_code == 1
-    assert result.stderr.startswith("error: ")
-    assert "must be the directory of a dataset" in result.stderr
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_build_that_has_not_ended_is_one_line_that_says_how_to_end_it(out: Path) -> None:
     (out / TRIALS).unlink()
     result = run("inspect", str(out))

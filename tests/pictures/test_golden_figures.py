@@ -1,4 +1,4 @@
-"""What all figures of a dataset show, compared with stored texts; see `helpers/golden.py`."""
+"""What figures of a dataset and hands show, compared with stored texts; see `helpers/golden.py`."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.golden import Golden, drawn, points
+from helpers.pages import surface_of
 from matplotlib.figure import Figure
 from pydrake.geometry import Cylinder, Role
 
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.pictures import figures, still_scene
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
-from drakegrasp.pictures.still_scene import StillScene, camera_pose, picture_hand
+from drakegrasp.pictures.still_scene import StillScene, link_surfaces, picture_hand
 
 
 @pytest.fixture
@@ -76,21 +78,21 @@ def test_hand_with_its_pads_and_frames(
     golden("figures/hand", "\n".join(lines))
 
 
-def test_camera_of_a_still_scene() -> None:
-    """It looks along a line of a known direction at the middle of points, which fill its view."""
-    points_W = np.array([[0.1, 0.2, 0.3], [0.3, 0.2, 0.3]])
-    X_WC = camera_pose(points_W, np.deg2rad(90.0), np.deg2rad(30.0), fill=2.0)
-    # From +y and 30 degrees above; the sphere's radius is half the distance, and the links'.
-    distance = (0.1 + 0.035) / np.sin(np.deg2rad(13.0)) / 2.0
-    back = np.array([0.0, np.cos(np.pi / 6.0), 0.5])
-    np.testing.assert_allclose(X_WC[:3, 3], [0.2, 0.2, 0.3] + distance * back, atol=1e-12)
-    np.testing.assert_allclose(X_WC[:3, :3].T, [[-1, 0, 0], [0, 0.5, -(0.75**0.5)], -back],
-                               atol=1e-12)  # fmt: skip
-
-
 def test_pads_are_drawn_on_both_sides_and_face_out() -> None:
     pad = np.array([[[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0]]])
     vertices, faces = still_scene._lifted(pad)
     np.testing.assert_allclose(vertices[:, 2], [4e-4] * 3 + [-4e-4] * 3)
     sides = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
     np.testing.assert_allclose(sides, [[0.0, 0.0, 4.0], [0.0, 0.0, -4.0]], atol=1e-12)
+
+
+def test_each_link_fills_its_collision_shapes() -> None:
+    """The Barrett Hand is shown as it collides, so the boxes around both are equal."""
+    hand = load_hand()
+    shapes, surfaces = link_shapes(hand.model), link_surfaces(StillScene(hand))
+    assert set(surfaces) == {link for link, parts in shapes.items() if parts}
+    for link, content in surfaces.items():
+        corners = np.concatenate(shapes[link])
+        box = np.array([corners.min(axis=0), corners.max(axis=0)])
+        # The corners of a cylinder enclose its circle.
+        np.testing.assert_allclose(surface_of(content).bounds, box, atol=1.5e-3)

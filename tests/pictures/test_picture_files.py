@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,6 +10,7 @@ import h5py
 import matplotlib as mpl
 import pytest
 from helpers import datasets
+from helpers.assertions import contents
 from helpers.datasets import OTO, TRIALS, edit_file, make_dataset
 
 from drakegrasp.dataset.assemble import assemble
@@ -19,10 +19,6 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.pictures.figures import NUMBERS_FILE, write_figures
 
 ALL = {"sheet", "outcomes", "distributions"}
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def lose_all(out: Path) -> None:
@@ -58,8 +54,7 @@ def test_the_same_dataset_gives_the_same_bytes(
     assert {name for name in files if files[name] != again[name]} == set()
 
 
-def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(sound, tmp_path / "out"))
+def test_what_the_dataset_lacks_is_left_out(out: Path, tmp_path: Path) -> None:
     (out / OTO).unlink()
     lose_all(out)
     folder = tmp_path / "figures"
@@ -79,9 +74,8 @@ def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None
     assert json.loads((folder / NUMBERS_FILE).read_text())["outcomes"]["samples"] == 0
 
 
-def test_pictures_of_samples_count_the_same_rows(sound: Path, tmp_path: Path) -> None:
+def test_pictures_of_samples_count_the_same_rows(out: Path, tmp_path: Path) -> None:
     """Two of the nine successes are removed; each picture tells of the seven samples."""
-    out = Path(shutil.copytree(sound, tmp_path / "out"))
     assemble(out, rejected=[0, 12])
     assert "sheet" in write_figures(out, tmp_path / "figures").names
     numbers = json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())

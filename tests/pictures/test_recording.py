@@ -98,37 +98,30 @@ def test_recording_a_trial_changes_no_bit_of_it(
     assert not list(path.parent.glob("*tmp*"))
 
 
-def test_attempt_that_is_not_simulated_is_shown_all_the_same(
-    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
-) -> None:
-    path = tmp_path / "miss.html"
-    missed = replace(attempt, ray_hits=False)
-    assert record_attempt(cube, standing(cube), missed, config, path).outcome is Outcome.RAY_MISS
-    everything = b"".join(commands_of(path))
-    assert OBJECT in everything and HAND in everything and b"predicted" not in everything
-    # At its start.
-    X_WO, X_GB = X_WT @ standing(cube), invert_pose(load_hand(config.hand).X_BG)
-    X_WB = places_of(path)["barrett_hand/base"]
-    np.testing.assert_allclose(X_WB, X_WO @ missed.X_OG @ X_GB, atol=1e-9)
-    np.testing.assert_allclose(places_of(path)["object/object"], X_WO, atol=1e-9)
-
-
 def test_object_at_rest_is_shown_without_a_hand(
     cube: ObjectModel, config: Config, tmp_path: Path
 ) -> None:
     record_object(cube, standing(cube), config, tmp_path / "still.html", caption="It rests.")
     everything = b"".join(commands_of(tmp_path / "still.html"))
-    assert OBJECT in everything and HAND not in everything
+    assert OBJECT in everything and HAND not in everything and b"predicted" not in everything
     assert ">It rests.</p>" in (tmp_path / "still.html").read_text()
 
 
-def test_arrow_of_a_contact_begins_at_the_contact(
+def test_attempt_that_is_not_simulated_is_shown_at_its_start_and_arrows_begin_at_contacts(
     cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
 ) -> None:
-    missed, path = replace(attempt, ray_hits=False), tmp_path / "v.html"
+    missed, path = replace(attempt, ray_hits=False), tmp_path / "miss.html"
     contacts = {"p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O}
-    record_attempt(cube, standing(cube), missed, config, path, **contacts)
-    places, first = places_of(path), "object/object/predicted/1"
+    trial = record_attempt(cube, standing(cube), missed, config, path, **contacts)
+    assert trial.outcome is Outcome.RAY_MISS
+    everything, places = b"".join(commands_of(path)), places_of(path)
+    assert OBJECT in everything and HAND in everything
+    X_WO, X_GB = X_WT @ standing(cube), invert_pose(load_hand(config.hand).X_BG)
+    X_WB = places["barrett_hand/base"]
+    np.testing.assert_allclose(X_WB, X_WO @ missed.X_OG @ X_GB, atol=1e-9)
+    np.testing.assert_allclose(places["object/object"], X_WO, atol=1e-9)
+
+    first = "object/object/predicted/1"
     np.testing.assert_allclose(places[first][:3, [2, 3]].T, [NHAT_Q_O[0], P_OQ[0]], atol=1e-12)
     shaft = (recording.ARROW - recording.HEAD) / 2.0
     assert places[f"{first}/shaft"][2, 3] == pytest.approx(shaft)

@@ -1,15 +1,18 @@
-"""Figures: contacts are drawn where they project, and what is shown is what was asked for."""
+"""Sheets, plots and thumbnails: contacts are where they project, bars as long as counts."""
 
 from __future__ import annotations
 
 import re
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.data_files import write_data_file
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.schema import Field
@@ -17,10 +20,9 @@ from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.pictures import figures
-from drakegrasp.pictures.figures import (
-    sample_sheet,
-)
-from drakegrasp.pictures.style import draw_contacts
+from drakegrasp.pictures.charts import card_picture, draw_distributions
+from drakegrasp.pictures.figures import sample_sheet
+from drakegrasp.pictures.style import MASK, NO_DEPTH, draw_contacts, strip_png
 from drakegrasp.vision.camera import intrinsics, project
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -61,6 +63,8 @@ def test_the_sheet_of_a_dataset_has_all_objects(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "grasping_oto.hdf5"
+    with pytest.raises(DataError, match=r"oto\.hdf5: must be a data file"):
+        sample_sheet(path)
     write_blocks(path, [])
     with pytest.raises(DataError, match="at least one sample"):
         sample_sheet(path)
@@ -121,6 +125,70 @@ def test_a_finger_that_a_grasp_leaves_out_is_not_drawn() -> None:
     assert "contact 1" not in {line.get_gid() for line in axes.lines}
 
 
-def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"missing\.hdf5: must be a data file"):
-        sample_sheet(tmp_path / "missing.hdf5")
+# Plots and thumbnails
+
+
+def test_what_is_beyond_a_histogram_is_in_its_last_bin() -> None:
+    values = np.append(np.linspace(0.0, 1.0, 99), [50.0, np.nan])
+    groups = {"samples": np.ones(101, bool), "stable": values < 0.5}
+    figure = draw_distributions([("slip [mm]", values)], groups, title="101 samples")
+    assert figure.legends[0].get_title().get_text() == "101 samples"
+    samples, stable = (patch.get_data().values for patch in figure.axes[0].patches)
+    assert samples.sum() == 100
+    assert stable.sum() == (values < 0.5).sum()
+    assert figure.axes[0].get_xlim()[1] < 2.0
+
+
+def test_panels_of_a_card_state_what_they_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drakegrasp.pictures.charts.png_bytes", lambda figure, dpi: figure)
+    each = {
+        "measures": {
+            "headline": {"value": 0.5, "low": 0.25, "high": 0.75},
+            "lifted": {"value": 0.6},
+        },
+        "lifted_within_mm": {"0": 0.0, "20": 0.5, "40": 0.6},
+        "calibration": [{"confidence": 0.1, "share": 0.2}, {"confidence": 0.9, "share": 0.7}],
+    }
+    card = {
+        "sets": {"net": each},
+        "headline": ["net"],
+        "measures": ["lifted"],
+        "limit_mm": 20.0,
+        "rows": 8,
+        "objects": 2,
+        "classes": 1,
+        "dataset": {"file": "data.hdf5", "split": "test", "rows_sha256": "0" * 64},
+        "settings": {"versions": {"drake": "1", "drakegrasp": "2"}},
+    }
+    figure: Any = card_picture(card)
+    headline, curves, calibration = figure.axes
+    assert headline.get_xlabel() == "per cent of rows, mean over objects"
+    assert curves.get_xlabel() == "d: largest distance from a requested contact [mm]"
+    assert calibration.get_xlabel() == "stated confidence, five groups"
+    assert [line.get_xdata().tolist() for line in headline.lines] == [[25.0, 75.0], [50.0], [60.0]]
+    assert curves.lines[0].get_xydata().tolist() == [[0.0, 0.0], [20.0, 50.0], [40.0, 60.0]]
+    assert calibration.lines[0].get_xydata().tolist() == [[0.1, 20.0], [0.9, 70.0]]
+
+
+def panels(image: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
+    """Return the three panels (S, S, 4) uint8 of a strip."""
+    strip = imread(BytesIO(strip_png(image, mask, far=0.75)))
+    assert strip.shape == (4, 12, 4)
+    return np.split(np.rint(255.0 * strip).astype(np.uint8), 3, axis=1)
+
+
+def test_strip_is_colour_depth_and_mask() -> None:
+    image = np.zeros((4, 4, 4), dtype=np.float32)
+    image[0, 1, 2], image[3] = 1.0, 0.75
+    image[3, 1, 2], image[3, 0, 0] = 0.3, 0.5
+    mask = np.zeros((4, 4), dtype=np.uint8)
+    mask[1, 2] = 1
+    colour, depth, seen = panels(image, mask)
+    assert colour[1, 2].tolist() == [255, 0, 0, 255]
+    assert (np.delete(colour.reshape(16, 4), 6, axis=0) == [0, 0, 0, 255]).all()
+    # The nearest pixel is the first of the colours, the farthest with a depth the last.
+    assert depth[1, 2].tolist() == [253, 231, 37, 255]
+    assert depth[0, 0].tolist() == [68, 1, 84, 255]
+    assert (depth[2:] == NO_DEPTH).all()
+    assert seen[1, 2].tolist() == MASK[1].tolist()
+    assert (seen[2:] == MASK[0]).all()

@@ -1,9 +1,10 @@
-"""The processes of this machine: what is begun ends, and Ctrl-C is one line."""
+"""The processes of this machine: what is begun ends, and what they may use."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -16,9 +17,13 @@ from typing import TypeVar
 import pytest
 
 from drakegrasp.cluster.connect import connect
+from drakegrasp.config import CameraConfig
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime import executor
+from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.runtime.executor import MOST_PROCESSES, count_workers, in_order, processes
+from drakegrasp.vision.rendering import build_renderer
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -63,14 +68,10 @@ def test_processes_start_by_default_only_where_the_work_is_long(
 
 def test_number_of_processes_may_be_the_largest() -> None:
     assert [count_workers(n) for n in (1, MOST_PROCESSES)] == [1, 10_000]
-    with pytest.raises(ConfigError, match="workers must be at most 10,000, got 10001"):
-        count_workers(MOST_PROCESSES + 1)
-
-
-@pytest.mark.parametrize("workers", [0, -1, 10**6])
-def test_number_of_processes_that_nobody_means_is_refused(workers: int) -> None:
-    with pytest.raises(ConfigError, match=r"workers must be at (least|most)"), processes(workers):
-        pass
+    for wrong in (0, -1, MOST_PROCESSES + 1):
+        must = rf"workers must be at (least 1|most 10,000), got {wrong}"
+        with pytest.raises(ConfigError, match=must), processes(wrong):
+            pass
 
 
 def test_results_come_in_the_order_of_the_items() -> None:
@@ -142,3 +143,30 @@ def test_worker_of_a_pool_is_told_to_start_none() -> None:
 def test_process_that_dies_is_one_error() -> None:
     with processes(2) as execute, pytest.raises(MachineError, match="a worker process died"):
         list(execute(os._exit, [1, 1, 1]))
+
+
+# What this process may use
+
+
+def test_too_little_memory_for_opengl_is_a_line(
+    cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for limit in (resource.RLIM_INFINITY, 2 * 10**9):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
+        prepare_rendering()
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (10**9, 10**9))
+    with pytest.raises(MachineError, match=r"at least 1\.5 GB to render, got 1 GB: raise `ulimit"):
+        build_renderer(cube, CameraConfig())
+
+
+@pytest.mark.parametrize("content", ["", "raise RuntimeError('broken')"])
+def test_triton_is_loaded_before_opengl_or_nothing_is_said(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "triton.py").write_text(f"import sys; sys.seen_triton = True\n{content}")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "triton", raising=False)
+    monkeypatch.setattr(sys, "seen_triton", False, raising=False)
+    prepare_rendering()
+    assert sys.seen_triton
+    monkeypatch.delitem(sys.modules, "triton", raising=False)

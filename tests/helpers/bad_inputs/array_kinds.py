@@ -18,6 +18,8 @@ from drakegrasp.runtime.files import seal
 
 #: Three contacts on the sides of a box, then their normals: a sound grasp.
 GRASP = np.array([0.03, 0, 0, -0.03, 0, 0, 0, 0.025, 0, 1, 0, 0, -1, 0, 0, 0, 1, 0.0])
+#: Two of them for the first rows of a split.
+ROWS = {"grasps": np.tile(GRASP, (2, 1)), "rows": np.arange(2)}
 
 
 def _npy(name: str, array: Any) -> Kind:
@@ -25,48 +27,22 @@ def _npy(name: str, array: Any) -> Kind:
     return Kind(name, lambda path: np.save(path, np.asarray(array), allow_pickle=True))
 
 
-def _header(name: str, text: str, content: bytes = bytes(144)) -> Kind:
+def _header(name: str, text: str) -> Kind:
     """Return a kind whose header is a text, of the length that it has."""
-
-    def spoil(path: Path) -> None:
-        line = text.encode().ljust(117) + b"\n"
-        path.write_bytes(b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line + content)
-
-    return Kind(name, spoil)
+    line = text.encode().ljust(117) + b"\n"
+    head = b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line
+    return whole_file(name, head + bytes(144))
 
 
-def _described(name: str, descr: str, shape: str, order: str = "False") -> Kind:
-    return _header(name, f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}}}")
-
-
-def _version(major: int) -> Callable[[Path], None]:
-    def spoil(path: Path) -> None:
-        content = path.read_bytes()
-        path.write_bytes(content[:6] + bytes([major]) + content[7:])
-
-    return spoil
+def _described(name: str, descr: str, shape: str) -> Kind:
+    return _header(name, f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}")
 
 
 _HEADERS: tuple[Kind, ...] = (
     _header("no header", "x"),
     _header("a header that calls", "__import__('os').getcwd()"),
-    _header("a header without shape", "{'descr': '<f8', 'fortran_order': False}"),
-    _described("a shape that overflows", "'<f8'", f"({2**32}, {2**32})"),
     _described("a shape beyond 64 bits", "'<f8'", f"({2**70},)"),
-    _described("a negative shape", "'<f8'", "(-1,)"),
-    _described("a shape of texts", "'<f8'", "('x',)"),
-    _described("a shape that is longer", "'<f8'", "(2, 18)"),
     _described("a type of Python", "'|O'", "(18,)"),
-    _described("a type without size", "'|V0'", "(18,)"),
-    _described("an order of text", "'<f8'", "(18,)", "'x'"),
-    Kind("cut in the header", lambda path: path.write_bytes(path.read_bytes()[:40])),
-    Kind("cut after the header", lambda path: path.write_bytes(path.read_bytes()[:128])),
-    Kind("cut in the magic text", lambda path: path.write_bytes(path.read_bytes()[:4])),
-    Kind("version 9", _version(9)),
-    Kind("version 2", _version(2)),
-    whole_file("a header of 4 GB", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'"),
-    whole_file("a zip", b"PK\x05\x06" + bytes(18)),
-    whole_file("a pickle", b"\x80\x04K\x05."),
 )
 PREDICTIONS_NPY: tuple[Kind, ...] = (
     *ANY_FILE,
@@ -83,9 +59,7 @@ PREDICTIONS_NPY: tuple[Kind, ...] = (
 
 def _predictions_hdf5(name: str, edit: Callable[[h5py.File], object]) -> Kind:
     def spoil(path: Path) -> None:
-        with h5py.File(path, "w") as file:
-            file["grasps"] = np.tile(GRASP, (2, 1))
-            file["rows"] = np.arange(2)
+        with h5py.File(path, "r+") as file:
             edit(file)
 
     return Kind(name, spoil)

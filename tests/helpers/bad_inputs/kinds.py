@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,43 +63,3 @@ ANY_TEXT = (
     whole_file("a text", b'"manifest"'),
     whole_file("a number of 10,000 digits", b"9" * 10_000),
 )
-
-
-class Workplace:
-    """A directory that is spoiled again and again, and put back.
-
-    Args:
-        pristine: What it holds when it is sound; it is not changed.
-        folder: Where the copy goes.
-    """
-
-    def __init__(self, pristine: Path, folder: Path) -> None:
-        self.pristine, self.folder = pristine, folder
-        shutil.copytree(pristine, folder, symlinks=True)
-        self.sound = self.state()
-
-    def state(self) -> dict[str, tuple[int, ...]]:
-        """Return what changes when something below the folder is written or replaced."""
-        state = {}
-        for path in self.folder.rglob("*"):
-            status = path.lstat()
-            times = () if path.is_dir() else (status.st_mtime_ns, status.st_size, status.st_ino)
-            state[str(path.relative_to(self.folder))] = (status.st_mode, *times)
-        return state
-
-    def restore(self) -> None:
-        """Put back what differs."""
-        now = self.state()
-        for name in sorted(now.keys() | self.sound.keys()):
-            if now.get(name) == self.sound.get(name):
-                continue
-            path, source = self.folder / name, self.pristine / name
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-            if source.is_dir():
-                shutil.copytree(source, path)
-            elif source.exists():
-                shutil.copyfile(source, path)
-        self.sound = self.state()

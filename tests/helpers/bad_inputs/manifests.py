@@ -28,6 +28,9 @@ def manifest_kinds(path: Path) -> tuple[Kind, ...]:
     )
 
 
+#: An attempt that is rejected, and decisions of an inspection.
+KEY = {"object": "1_box_a", "candidate": 0, "standoff_index": 0}
+SOUND_DECISIONS = json.dumps({"version": 1, "rejected": [KEY], "kept": [KEY]}).encode()
 _NO_TREE = ("null", "list", "mapping", "truth value")
 _COUNT = (*_NO_TREE, "number as text", "negative", "fraction", "NaN", "huge")
 _NAME = (*_NO_TREE, "empty text", "control characters", "half a surrogate", "zero")

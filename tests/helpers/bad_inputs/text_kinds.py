@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from helpers.bad_inputs.kinds import ANY_TEXT, Kind, whole_file
-from helpers.bad_inputs.trees import keys, ways
 
 #: Texts that are no YAML, or none that anybody reads.
 ANY_YAML: tuple[Kind, ...] = (
@@ -29,26 +28,6 @@ ANY_YAML: tuple[Kind, ...] = (
     whole_file("a text with a null byte", "seed: \x00\n"),
 )
 
-
-_NO_NUMBER = ("text", "list", "mapping", "truth value", "NaN", "infinite", "date")
-_HAND_KEYS = {
-    ("version",): (*_NO_NUMBER, "null", "negative", "zero"),
-    ("model",): ("text", "list", "mapping", "truth value", "null", "zero"),
-    ("palm", "link"): ("text", "list", "mapping", "null", "zero"),
-    ("palm", "p_BG"): (*_NO_NUMBER, "null", "list of lists"),
-    ("fingers",): ("text", "list", "mapping", "null"),
-    ("fingers", 0, "name"): ("list", "mapping", "null", "zero"),
-    ("fingers", 0, "closing_joint"): ("text", "list", "null"),
-    ("fingers", 0, "pad_point"): (*_NO_NUMBER, "null"),
-    ("standoffs",): (*_NO_NUMBER, "null", "negative", "list of lists"),
-}
-HAND: tuple[Kind, ...] = (
-    *ANY_YAML,
-    *keys(_HAND_KEYS),
-    *ways(("fingers", 0, "required"), "text", "list", "null"),
-    *ways(("closing_speed_deg",), "text", "list", "null", "negative", "zero", "NaN", "infinite"),
-    *ways(("drive",), "text", "list", "null", "zero"),
-)
 
 _EXTREME = ("", " ", "x", "1.5", "nan", "inf", "1e3", "-1", str(10**30), "9" * 5000, "٣x")
 #: Options of `build` with the values that must be refused.

@@ -1,4 +1,4 @@
-"""Drawn faults are those that the script's text lists, in the rooms that are asked for."""
+"""Drawn faults are those that the script lists; fuzzing finds other values without a word."""
 
 from __future__ import annotations
 
@@ -90,3 +90,15 @@ def test_tests_of_a_module_are_those_of_its_room_and_near_ones(draw_faults: Modu
     assert tests == [
         f"tests/{name}" for name in ("hand/test_module.py", "hand/test_far.py", "test_all.py")
     ]
+
+
+def test_other_values_need_a_line() -> None:
+    fuzz = load_script("measurements/fuzz")
+    sound = fuzz.Said(code=0, out="8 figures\n", err="⠙ draw 1/8\n")
+    other = fuzz.Said(code=0, out="7 figures\n", err="⠙ draw 1/7\n")
+    assert fuzz.judge(sound, sound) is None
+    assert fuzz.judge(other, sound) == "other values without a word"
+    told = fuzz.Said(code=0, out="7 figures\n", err="objects/a.plan.h5: must be a plan\n")
+    assert fuzz.judge(told, sound) is None
+    refused = fuzz.Said(code=2, err="⠙ export   0/12\nerror: no\n")
+    assert fuzz.judge(refused, sound) is None
