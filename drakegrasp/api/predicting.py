@@ -40,7 +40,8 @@ def predict_scenes(
 
     Args:
         scenes: The file scenes.hdf5 or clutter.hdf5 of a dataset. In the latter, lifts are tried
-            among the other objects, as completed from the view, and among the surroundings.
+            and arms are asked among the other objects, as completed from the view, and among the
+            surroundings.
         split: `train`, `valid` or `test`.
         simulate: Largest number of grasps of a view that are lifted on the object as completed from
             this view, see `rank`; the lifts have the rules of the dataset.
@@ -58,8 +59,7 @@ def predict_scenes(
         (`confidence`); and the number of views that show too little of their object for any.
 
     Raises:
-        ConfigError: If client and workers are both given, an override is invalid, or an arm is
-            given with clutter.hdf5.
+        ConfigError: If client and workers are both given, or an override is invalid.
         DataError: If the file cannot be used.
         GraspError: If no view yields a posture, or a view is invalid.
         MachineError: If a worker would give other results than this machine.

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 import numpy.typing as npt
 
 from drakegrasp.api.verifying import run_verification, verify_by_protocol
-from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes import SceneRows
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.protocols.postures import describe, versions
-from drakegrasp.protocols.protocol import Lift, Protocol, find_protocol
+from drakegrasp.protocols.protocol import Lift, find_protocol
 from drakegrasp.reach.arm import Arm
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.scoring.references import REFERENCES
@@ -97,22 +96,10 @@ def score(
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
 
     # The rules of the score, and the predictions.
-    overrides = ("verify.max_tries=1", *overrides)
-    config = dataset_config(dataset, overrides=overrides)
-    rule, stored = find_protocol(protocol)
-    in_mujoco = not isinstance(rule, Lift)
-    if isinstance(dataset, SceneRows) and dataset.several:
-        if in_mujoco:
-            raise ConfigError(f"protocol must be lift for scenes of several objects, got {stored}")
-        if arm is not None:
-            raise ConfigError(f"arm must be None for scenes of several objects, got {arm.name}")
-    if in_mujoco and arm is not None:
-        raise ConfigError(f"arm must be None with protocol {stored}, got {arm.name}")
-    if in_mujoco and (client or workers.get("scheduler") or workers.get("scheduler_file")):
-        raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
-    settings = _settings(config, overrides, rule, stored)
-    if arm is not None:
-        settings["arm"] = arm.described()
+    rules = _Rules(dataset, protocol, overrides, arm)
+    if rules.in_mujoco and (client or workers.get("scheduler") or workers.get("scheduler_file")):
+        raise ConfigError(f"scheduler must be None with protocol {rules.stored}, got one")
+    settings = rules.settings()
     name, ranked = ranked_sets(
         predictions, dataset, rows=rows, confidence=confidence, read_as=read_as
     )
@@ -122,11 +109,13 @@ def score(
 
     # The verdicts, from this process or from workers.
     def try_all(grasps: GraspRows, chosen: Sequence[int], deliver: Deliver) -> None:
-        placed = place_on_rows(grasps, dataset, chosen, config=config, overrides=overrides)
-        if in_mujoco:
+        placed = place_on_rows(
+            grasps, dataset, chosen, config=rules.config, overrides=rules.overrides
+        )
+        if rules.in_mujoco:
             verify_by_protocol(
                 placed,
-                config,
+                rules.config,
                 protocol,
                 lambda i, found, _: deliver(placed[i].index, protocol_verdict(found[0])),
                 keep=Path(scratch if out is None else out) / CONVEX_PARTS,
@@ -138,7 +127,7 @@ def score(
         # This package's own trials.
         run_verification(
             placed,
-            config,
+            rules.config,
             client=client,
             on_result=lambda index, result: deliver(index, verdict_of(_asked(result, arm))),
             show=show,
@@ -154,7 +143,7 @@ def score(
             train=_training_rows(dataset, references) if train is None else train,
             references=references,
             per_object=per_object,
-            config=config,
+            config=rules.config,
             settings=settings,
             again=again,
             folder=None if out is None else Path(out),
@@ -166,6 +155,54 @@ def score(
 
 def _asked(result: Verification, arm: Arm | None) -> Verification:
     return result if arm is None else result.reached_by(arm)
+
+
+class _Rules:
+    """All that decides a verdict apart from the row.
+
+    Attributes:
+        config: Configuration of the trials.
+        overrides: The settings in it that are not of the dataset.
+        protocol: The rule of a verdict.
+        stored: Its name on the card.
+        in_mujoco: Whether grasps are tried in MuJoCo, on this machine.
+        arm: The arm that is asked, if any.
+
+    Raises:
+        ConfigError: If there is no such protocol, or it cannot have these rows or an arm.
+    """
+
+    def __init__(
+        self, dataset: GraspDataset, protocol: str, overrides: Sequence[str], arm: Arm | None
+    ) -> None:
+        self.arm, self.overrides = arm, ("verify.max_tries=1", *overrides)
+        self.config = dataset_config(dataset, overrides=self.overrides)
+        self.protocol, self.stored = find_protocol(protocol)
+        self.in_mujoco = not isinstance(self.protocol, Lift)
+        if self.in_mujoco and isinstance(dataset, SceneRows) and dataset.several:
+            got = self.stored
+            raise ConfigError(f"protocol must be lift for scenes of several objects, got {got}")
+        if self.in_mujoco and arm is not None:
+            raise ConfigError(f"arm must be None with protocol {self.stored}, got {arm.name}")
+
+    def settings(self) -> dict[str, Any]:
+        """Return them as JSON types, with the versions; CoACD cuts objects for MuJoCo.
+
+        Raises:
+            MachineError: If a package of the protocol is missing.
+        """
+        settings: dict[str, Any] = {
+            "config": self.config.to_dict(),
+            "overridden": sorted(overridden_keys(self.overrides)),
+            "versions": installed_versions(self.config),
+        }
+        if not isinstance(self.protocol, Lift):
+            require_mujoco("mujoco", "coacd")
+            used = {**versions(), "coacd": metadata.version("coacd")}
+            settings["protocol"] = {**describe(self.protocol, self.stored), "versions": used}
+        if self.arm is not None:
+            settings["arm"] = self.arm.described()
+        return settings
 
 
 def _method(
@@ -189,26 +226,6 @@ def _method(
             f"against must be beside predictions whose file has another name, got {got}"
         )
     return {name: ranked}
-
-
-def _settings(
-    config: Config, overrides: Sequence[str], rule: Protocol, stored: str
-) -> dict[str, Any]:
-    """Return all that decides a verdict apart from the row; CoACD cuts objects for MuJoCo.
-
-    Raises:
-        MachineError: If a package of the protocol is missing.
-    """
-    settings: dict[str, Any] = {
-        "config": config.to_dict(),
-        "overridden": sorted(overridden_keys(overrides)),
-        "versions": installed_versions(config),
-    }
-    if not isinstance(rule, Lift):
-        require_mujoco("mujoco", "coacd")
-        used = {**versions(), "coacd": metadata.version("coacd")}
-        settings["protocol"] = {**describe(rule, stored), "versions": used}
-    return settings
 
 
 def _training_rows(dataset: GraspDataset, references: Sequence[str]) -> GraspDataset:

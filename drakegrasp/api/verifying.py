@@ -187,7 +187,8 @@ def verify_grasps(
         config: Hand, physics, lift and rules. If None, those of the placed object or of the
             dataset, or else the defaults. If it replaces a dataset's, values drawn for a row are
             not used.
-        arm: An arm, see `load_arm`. It is asked in this process, for the first wrist poses.
+        arm: An arm, see `load_arm`. It is asked in this process, for the first wrist poses, among
+            what is around the object.
         client: A Dask client whose workers share the work. If None, up to four grasps are verified
             in this process, and more than four by workers on this machine.
         show: Whether to show progress on standard error.
@@ -202,14 +203,7 @@ def verify_grasps(
         DataError: If the dataset cannot be used, or has changed since the sample was read.
         MachineError: If a worker would give other results than this machine.
     """
-    if isinstance(on, Clutter):
-        if object is None:
-            raise GraspError(f"object must be given with a scene, {on}, got None")
-        if arm is not None:
-            raise GraspError(f"arm must be None on a scene, got {arm.name}")
-        on = on.placed(object)
-    elif object is not None:
-        raise GraspError(f"object must be given with a scene only, got {object!r}")
+    on = _target(on, object)
     if isinstance(on, Sample | GraspDataset):
         _validate_none(on, X_TC=X_TC, units=units, X_TO=X_TO)
         if isinstance(on, Sample) and rows is not None:
@@ -220,7 +214,6 @@ def verify_grasps(
         drawn, frame = config is None, frame or "camera"
         placed = contacts_on_rows(grasps, data, chosen, config=used, drawn=drawn, frame=frame)
     else:
-        _validate_target(on)
         if rows is not None:
             raise GraspError(f"rows must be given with a GraspDataset only, got {rows!r}")
         target = place_object(on, units=units, X_TO=X_TO, hand=hand, config=config)
@@ -239,8 +232,19 @@ def _validate_none(on: Sample | GraspDataset, **given: object) -> None:
             )
 
 
-def _validate_target(on: object) -> None:
-    if not isinstance(on, str | Path | trimesh.Trimesh | PlacedObject):
+def _target(on: GraspTarget, object: int | str | None) -> ObjectMesh | Sample | GraspDataset:
+    """Return the target of grasps, which is an object of a scene in place of the scene.
+
+    Raises:
+        GraspError: If it is none, or an object is not given with a scene and only then.
+    """
+    if isinstance(on, Clutter):
+        if object is None:
+            raise GraspError(f"object must be given with a scene, {on}, got None")
+        return on.placed(object)
+    if object is not None:
+        raise GraspError(f"object must be given with a scene only, got {object!r}")
+    if not isinstance(on, str | Path | trimesh.Trimesh | PlacedObject | Sample | GraspDataset):
         raise GraspError(
             "on must be the path of a mesh, a trimesh.Trimesh, a placed object, a scene, a Sample "
             f"or a GraspDataset, got a {type(on).__name__}"
@@ -249,6 +253,7 @@ def _validate_target(on: object) -> None:
         raise GraspError(
             f"on must be GraspDataset({str(on)!r}, split=...) for a data file, got its path"
         )
+    return on
 
 
 def run_verification(

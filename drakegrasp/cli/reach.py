@@ -71,6 +71,7 @@ def reach(
     *,
     robot: ArmOptions = ArmOptions(),
     name: Name | None = None,
+    clutter: bool = False,
     picture: Annotated[NewFile | None, Parameter(name="--map", metavar="PNG")] = None,
     workers: Count | None = None,
     quiet: bool = False,
@@ -78,11 +79,14 @@ def reach(
     """Ask whether an arm gets its hand to the samples.
 
     The command writes OUT/reach/NAME.hdf5: for each sample, whether the arm comes straight to it
-    and lifts, and its joint positions. Rows that are there are kept.
+    and lifts, and its joint positions. Rows that are there are kept. With --clutter it writes
+    OUT/reach/clutter/NAME.hdf5.
 
     Args:
         out: Directory of the dataset.
         name: Name of the file. [default: that of the arm]
+        clutter: Ask for the free grasps of clutter.hdf5 instead: arm and hand must not hit the
+            other objects and the walls, either.
         picture: Instead of the file, draw a map: where on the table the arm reaches the grasps of
             some samples.
         workers: Number of processes on this machine. [default: one per core]
@@ -96,11 +100,14 @@ def reach(
     if chosen is None:
         raise UsageError("--arm must be given, got none")
     if picture is not None:
+        if clutter:
+            raise UsageError("--clutter must not be given with --map, got both")
         _draw_map(out, chosen, picture, workers, show=not quiet)
         return
     with processes(workers, "reach", "objects", show=not quiet) as more:
-        rows = reach_dataset(out, chosen, name=name, **more)
-    say(f"{counted(rows.count, 'grasp')} in {reach_path(out, name or chosen.name)}")
+        rows = reach_dataset(out, chosen, name=name, clutter=clutter, **more)
+    path = reach_path(out, name or chosen.name, clutter=clutter)
+    say(f"{counted(rows.count, 'grasp')} in {path}")
     for code, outcome in enumerate(REACHES):
         say(f"{outcome}: {(rows.reach_outcome == code).sum():,}")
 

@@ -24,6 +24,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import file_attributes, object_columns, shards_sha256
 from drakegrasp.dataset.hdf5 import (
+    CLUTTER_REACH,
     REACH,
     SAMPLES,
     SCENES,
@@ -40,6 +41,7 @@ from drakegrasp.dataset.hdf5 import (
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import (
     CLUTTER_FILE,
+    CLUTTER_FOLDER,
     DATA_FILES,
     MANIFEST_FILE,
     SCENES_FILE,
@@ -218,13 +220,15 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
     with suppress(DataError):  # a missing shard is found with its object
         seals = shards_sha256(out, manifest)
     cameras = {name: camera for camera, name in DATA_FILES.items()}
-    arms = [reach_path(out, name).relative_to(out).as_posix() for name in reach_names(out)]
-    for name in (*FILES, *arms):
+    arms, in_scenes = _files_of_arms(out, clutter=False), _files_of_arms(out, clutter=True)
+    for name in (*FILES, *arms, *in_scenes):
         if name in ON_REQUEST and not (out / name).exists():
             continue
         with _reported(found, name, "the file must be there, readable and of this schema"):
             due = file_attributes(manifest, seals, cameras.get(name, ""))
             known = {key: value for key, value in due.items() if key != "shards" or seals}
+            if name in in_scenes and (among := headers.get(CLUTTER_FILE)):
+                known["clutter"] = among.attributes.get("clutter")
             headers[name] = _header(out / name, name, known, found)
 
     units = zip(manifest.objects, manifest.headers_by_object(), strict=True)
@@ -240,12 +244,13 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
         if name == TRIALS_FILE and sound:
             tasks.append(partial(_objects, out))
         tasks.append(partial(_seal, out / name, name))
+        refers = headers.get(CLUTTER_FILE) if name in in_scenes else trials if compared else None
         rows = _Rows(
             path=out / name,
             name=name,
             stamp=stamp(out / name),
             attributes=header.attributes,
-            counts={**(trials.counts if compared and trials else {}), **header.counts},
+            counts={**(refers.counts if refers else {}), **header.counts},
             max_distance=manifest.config.filters.max_surface_distance if compared else None,
         )
         tasks += [
@@ -254,6 +259,12 @@ def _look_at(out: Path) -> tuple[list[Violation], list[Task]]:
             for start in range(0, count, TASK_ROWS)
         ]
     return found, tasks
+
+
+def _files_of_arms(out: Path, *, clutter: bool) -> list[str]:
+    """Return the files of arms by their paths within a dataset, see `reach_path`."""
+    paths = (reach_path(out, name, clutter=clutter) for name in reach_names(out, clutter=clutter))
+    return [path.relative_to(out).as_posix() for path in paths]
 
 
 def _header(path: Path, name: str, due: Mapping[str, Any], found: list[Violation]) -> _Header:
@@ -265,7 +276,7 @@ def _header(path: Path, name: str, due: Mapping[str, Any], found: list[Violation
         due: The attributes that the file would be written with now, as far as they are known.
         found: Gets the violations.
     """
-    layout = FILES.get(name, REACH)
+    layout = _layout(name)
     with open_hdf5(path) as file:
         validate_schema_version(path, file.attrs.get("schema_version"))
         wrong = list(mistakes(file, layout))
@@ -283,15 +294,21 @@ def _header(path: Path, name: str, due: Mapping[str, Any], found: list[Violation
     if name in ON_REQUEST:
         keys, command = [*STATE], ON_REQUEST[name]
     elif name not in FILES:
-        keys, command = ["config_hash", "shards"], "reach"
+        keys, command = ["config_hash", "shards", "signature", "clutter"], "reach"
     told = [key for key in keys if key in due and key in attributes and key != "config"]
     other = next((key for key in told if not np.array_equal(attributes[key], due[key])), "")
     if other:
-        of = "the shards that are there" if other == "shards" else MANIFEST_FILE
+        known = {"shards": "the shards that are there", "clutter": CLUTTER_FILE}
+        of = known.get(other, MANIFEST_FILE)
         again = f"another; run `drakegrasp {command}` again"
         what = f"attribute {other} must be that of {of}"
         found.append(Violation(file=name, what=what, got=again))
     return _Header(attributes=attributes, counts=counts, mistakes=bool(wrong), other=bool(other))
+
+
+def _layout(name: str) -> Layout:
+    """Return the layout of a file, by its path within the dataset."""
+    return FILES.get(name) or (CLUTTER_REACH if CLUTTER_FOLDER in Path(name).parts else REACH)
 
 
 def _seal(path: Path, name: str) -> list[Violation]:
@@ -412,7 +429,7 @@ class _Rows:
     @property
     def fields(self) -> tuple[Field, ...]:
         """Fields of the group."""
-        return FILES.get(self.name, REACH).tables[self.group]
+        return _layout(self.name).tables[self.group]
 
 
 #: The words of a rule, the rows (n,) that break it, and what they have instead (n, ...).
@@ -453,9 +470,9 @@ def _check_rows(task: _Rows) -> list[Violation]:
             stages += [[_as_in_trials], [_on_mesh]]
     elif task.group == "grasps":
         stages += [[_as_labelled]]
-    elif task.group == "reach":
+    elif task.group in ("reach", "clutter"):
         stages += [[_as_reached]]
-        if task.max_distance is not None:
+        if task.group == "reach" and task.max_distance is not None:
             stages += [[_of_grasp]]
     found = list[Violation]()
     for checks in stages:

@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.schema import (
     CAMERAS,
+    CLUTTER_REACH_TABLES,
     DATA_TABLES,
     LETTERS,
     REACH_TABLES,
@@ -263,6 +264,8 @@ OF_REACH: Kinds = {
     "base": "X, Y, Z and yaw",
     "mount": "a pose of 12 numbers",
 }
+#: Attributes of files of arms about scenes of several objects.
+OF_CLUTTER_REACH: Kinds = {**OF_REACH, "signature": "a text", "clutter": "a mapping in JSON"}
 
 
 class Layout(NamedTuple):
@@ -279,11 +282,13 @@ class Layout(NamedTuple):
     tables: Tables
 
 
-#: Layouts of grasping_oto.hdf5 and grasping_otm.hdf5, trials.hdf5, scenes.hdf5, reach/NAME.hdf5.
+#: Layouts of grasping_oto.hdf5 and grasping_otm.hdf5, trials.hdf5, scenes.hdf5, reach/NAME.hdf5,
+#: reach/clutter/NAME.hdf5.
 SAMPLES = Layout("a data file of drakegrasp", OF_CAMERA, DATA_TABLES)
 TRIALS = Layout("the trials of a dataset", ORIGIN, TRIAL_TABLES)
 SCENES = Layout("the scenes of a dataset", OF_SCENES, SCENE_TABLES)
 REACH = Layout("the reach of an arm", OF_REACH, REACH_TABLES)
+CLUTTER_REACH = Layout("the reach of an arm in scenes", OF_CLUTTER_REACH, CLUTTER_REACH_TABLES)
 
 
 def mistakes(file: h5py.File, layout: Layout) -> Iterator[Difference]:
@@ -311,8 +316,9 @@ def _opened_whole(path: Path, layout: Layout) -> Iterator[h5py.File]:
 
 #: Context managers that open a file of a dataset, given its path. They raise a DataError if the
 #: file is missing, damaged, or differs from its layout.
-open_samples, open_trials, open_scenes, open_reach = (
-    partial(_opened_whole, layout=layout) for layout in (SAMPLES, TRIALS, SCENES, REACH)
+open_samples, open_trials, open_scenes, open_reach, open_clutter_reach = (
+    partial(_opened_whole, layout=layout)
+    for layout in (SAMPLES, TRIALS, SCENES, REACH, CLUTTER_REACH)
 )
 
 

@@ -37,14 +37,22 @@ def plan_path(out: Path, name: str) -> Path:
     return out / "objects" / f"{_file_name(name)}.plan.h5"
 
 
-def reach_path(out: Path, name: str) -> Path:
-    """Return the path of what an arm, by a name of its own, can do about the grasps."""
-    return out / REACH_FOLDER / f"{_file_name(name)}.hdf5"
+def reach_path(out: Path, name: str, *, clutter: bool = False) -> Path:
+    """Return the path of what an arm, by a name of its own, can do about the grasps.
+
+    Args:
+        out: Directory of the dataset.
+        name: The name.
+        clutter: Whether it is about the grasps of clutter.hdf5, not about samples.
+    """
+    folder = out / REACH_FOLDER / (CLUTTER_FOLDER if clutter else "")
+    return folder / f"{_file_name(name)}.hdf5"
 
 
-def reach_names(out: Path) -> list[str]:
-    """Return the names of the arms that a dataset has files of."""
-    return sorted(path.stem for path in (out / REACH_FOLDER).glob("*.hdf5"))
+def reach_names(out: Path, *, clutter: bool = False) -> list[str]:
+    """Return the names of the arms that a dataset has files of; see `reach_path`."""
+    folder = reach_path(out, "any", clutter=clutter).parent
+    return sorted(path.stem for path in folder.glob("*.hdf5"))
 
 
 def clutter_path(out: Path, number: int) -> Path:

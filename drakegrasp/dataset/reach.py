@@ -1,6 +1,7 @@
-"""What arms can do about the grasps of a dataset, read from OUT/reach/NAME.hdf5.
+"""What arms can do about the grasps of a dataset, read from OUT/reach/NAME.hdf5 and reach/clutter.
 
-Rows are known by object, palm pose and stand-off, so a file also serves a dataset that grew since.
+Samples are known by object, palm pose and stand-off, so a file also serves a dataset that grew
+since; grasps of scenes by their row in clutter.hdf5.
 `drakegrasp.reach.rows` writes the files.
 """
 
@@ -15,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import AnyArray, open_reach, read_columns
+from drakegrasp.dataset.hdf5 import AnyArray, open_clutter_reach, open_reach, read_columns
 from drakegrasp.dataset.paths import reach_names, reach_path
-from drakegrasp.dataset.schema import REACH_FIELDS
+from drakegrasp.dataset.schema import CLUTTER_REACH_FIELDS, REACH_FIELDS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import counted, printable
 from drakegrasp.frames import unpack_pose
@@ -95,6 +96,26 @@ def is_reachable(
     reachable = asked.copy()
     reachable[asked] = rows.reachable[place[asked]]
     return asked, reachable
+
+
+def reached_in_scenes(out: Path, free: npt.NDArray[np.bool_]) -> dict[str, npt.NDArray[np.bool_]]:
+    """Return which grasps (n,) of clutter.hdf5 each arm reaches that was asked for all free ones.
+
+    Args:
+        out: Directory of the dataset.
+        free: (n,), which of the grasps are free.
+
+    Raises:
+        DataError: If a file is damaged.
+    """
+    found = {}
+    for name in reach_names(out, clutter=True):
+        with open_clutter_reach(reach_path(out, name, clutter=True)) as file:
+            rows = read_columns(file["clutter"], CLUTTER_REACH_FIELDS, ("grasp", "reachable"))
+        if np.array_equal(rows.grasp, np.flatnonzero(free)):
+            found[name] = np.zeros_like(free)
+            found[name][rows.grasp] = rows.reachable
+    return found
 
 
 def rows_by_identity(

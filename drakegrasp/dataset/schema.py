@@ -102,7 +102,7 @@ class Field:
 
     Attributes:
         name: Path below the group, which is a split, `/trials`, `/objects`, `/successes`, `/looks`,
-            `/grasps`, `/scenes`, `/views`, `/visible`, `/reach`, `/shapes` or `/rows`.
+            `/grasps`, `/scenes`, `/views`, `/visible`, `/reach`, `/clutter`, `/shapes` or `/rows`.
         dtype: NumPy's name of the type, or "str" for UTF-8 text.
         meaning: One sentence that describes the field.
         shape: Axes of one row, separated by blanks; empty for a scalar. An axis is an integer or a
@@ -768,11 +768,7 @@ SCENE_OBJECT_FIELDS: tuple[Field, ...] = (
 #: What an arm can do about a grasp: all of it, or where the branch ends that comes farthest.
 REACHES = ("reachable", "out_of_reach", "collision", "approach", "lift")
 
-#: A row per grasp that an arm was asked for, in `/reach` of reach/NAME.hdf5.
-REACH_FIELDS: tuple[Field, ...] = (
-    Field("object", "str", "name of the object"),
-    *(field for field in TRIAL_FIELDS if field.name in ("candidate", "standoff_index")),
-    Field("trial_id", "int64", "row of trials.hdf5"),
+_REACHED: tuple[Field, ...] = (
     Field("reachable", "bool", "whether one branch of the arm's inverse kinematics has the "
           "approach, the grasp and the lift, within joint limits, without a jump or a collision"),
     Field("reach_outcome", "uint8", "0 reachable; otherwise where the branch ends that comes "
@@ -789,7 +785,27 @@ REACH_FIELDS: tuple[Field, ...] = (
           unit="m", some=True, shown=Shown("clearance of the arm", "mm")),
 )
 
-#: A row per corner of the shapes of the arm, in `/shapes` of reach/NAME.hdf5.
+#: A row per grasp that an arm was asked for, in `/reach` of reach/NAME.hdf5.
+REACH_FIELDS: tuple[Field, ...] = (
+    Field("object", "str", "name of the object"),
+    *(field for field in TRIAL_FIELDS if field.name in ("candidate", "standoff_index")),
+    Field("trial_id", "int64", "row of trials.hdf5"),
+    *_REACHED,
+)
+
+#: A row per free grasp of clutter.hdf5 that an arm was asked for, in `/clutter` of
+#: reach/clutter/NAME.hdf5.
+CLUTTER_REACH_FIELDS: tuple[Field, ...] = (
+    Field("grasp", "int64", "row of /grasps of clutter.hdf5"),
+    Field("scene", "int32", "row of /scenes of clutter.hdf5"),
+    Field("object", "uint8", "index of the grasped object in the scene"),
+    *_REACHED[:-1],
+    replace(_REACHED[-1], meaning="least distance, all the way, of arm and hand from table and "
+            "walls, and of the arm and the open hand from all objects; at most 0.2, NaN if not "
+            "reachable"),
+)
+
+#: A row per corner of the shapes of the arm, in `/shapes` of both files of an arm.
 SHAPE_FIELDS: tuple[Field, ...] = (
     Field("link", "str", "name of the link"),
     Field("hull", "uint16", "number of the convex hull to which the corner belongs"),
@@ -819,6 +835,7 @@ SCENE_TABLES: Tables = {
     "visible": VISIBLE_FIELDS,
 }
 REACH_TABLES: Tables = {"reach": REACH_FIELDS, "shapes": SHAPE_FIELDS}
+CLUTTER_REACH_TABLES: Tables = {"clutter": CLUTTER_REACH_FIELDS, "shapes": SHAPE_FIELDS}
 #: Columns that number the rows of another group, by their group.
 ROW_NUMBERS: Mapping[str, Mapping[str, str]] = {
     "trials": {"object": "objects"},
@@ -828,5 +845,6 @@ ROW_NUMBERS: Mapping[str, Mapping[str, str]] = {
     "views": {"scene": "scenes"},
     "grasps": {"scene": "scenes"},
     "reach": {"trial_id": "trials"},
+    "clutter": {"scene": "scenes", "grasp": "grasps"},
     "visible": {"view": "views", "grasp": "grasps"},
 }

@@ -14,7 +14,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.assemble import validate_assembled
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.paths import CLUTTER_FILE, TRIALS_FILE
-from drakegrasp.dataset.reach import count_reach
+from drakegrasp.dataset.reach import count_reach, reached_in_scenes
 from drakegrasp.dataset.scenes import SceneDataset, validate_state
 from drakegrasp.dataset.schema import NOT_TRIED, SPLITS
 from drakegrasp.dataset.trials import NONE, Trials
@@ -181,6 +181,7 @@ class ClutterCount:
         tried: Free grasps that were tried in simulation.
         kept, clean: Tried grasps with these labels.
         neighbour_hit: Tried grasps with this outcome.
+        reachable: Free grasps that arms reach which were asked, by the names of their files.
     """
 
     surroundings: str
@@ -191,12 +192,14 @@ class ClutterCount:
     kept: int
     clean: int
     neighbour_hit: int
+    reachable: dict[str, int]
 
     def explain(self) -> str:
         """Return how many grasps are free, and how the tried ones ended."""
         free = f"{self.free:,} of {counted(self.grasps, 'grasp')} free"
         if self.grasps:
             free += f" ({self.free / self.grasps:.0%})"
+        free += "".join(f", {name} reaches {n:,} of these" for name, n in self.reachable.items())
         tried = f"{self.kept:,} kept, {self.clean:,} clean, {self.neighbour_hit:,} hit a neighbour"
         where = f"{counted(self.scenes, 'scene')} of several objects ({self.surroundings})"
         return printable(f"{where}: {free}; of {self.tried:,} tried {tried}")
@@ -218,12 +221,14 @@ def count_clutter(out: Path) -> list[ClutterCount]:
     labels = {name: grasps[name] for name in ("free", "kept", "clean")}
     labels["tried"] = outcome != NOT_TRIED
     labels["neighbour_hit"] = outcome == Outcome.NEIGHBOUR_HIT
+    reached = reached_in_scenes(out, labels["free"])
     return [
         ClutterCount(
             surroundings=name,
             scenes=int((around == name).sum()),
             grasps=int((where == name).sum()),
             **{key: int((has & (where == name)).sum()) for key, has in labels.items()},
+            reachable={arm: int((has & (where == name)).sum()) for arm, has in reached.items()},
         )
         for name in sorted(set(around))
     ]

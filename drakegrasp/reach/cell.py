@@ -1,13 +1,13 @@
 """An arm with a hand at the table, as a diagram of Drake that answers whether it collides.
 
-Input: an `Arm`, a hand and its mount. Output: a `Cell` with the chain of the arm, and queries at
-configurations of arm and hand: do links collide with each other or with the table, how near do they
-come to the table, and where are points on the arm.
+Input: an `Arm`, a hand and its mount, and the walls on the table. Output: a `Cell` with the chain
+of the arm, and queries at configurations of arm and hand: do links collide with each other, the
+table or a wall, how near do they come to table and walls, and where are points on the arm.
 
-Drake checks links against links and the table. The object need not be convex and Drake would take
-its hull, so points on the links are looked up in the object's distance field (`reaching.py`). Pairs
-of links that collide in every configuration overlap by construction and are left out; so are pairs
-within the hand, whose postures were simulated. The frame {T} is Drake's world.
+Drake checks links against links, the table and walls. Objects need not be convex and Drake would
+take their hulls, so points on the links are looked up in their distance fields (`reaching.py`).
+Pairs of links that collide in every configuration overlap by construction and are left out; so are
+pairs within the hand, whose postures were simulated. The frame {T} is Drake's world.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ from pydrake.planning import RobotDiagramBuilder, SceneGraphCollisionChecker
 
 from drakegrasp.config import HandSource
 from drakegrasp.errors import ConfigError, first_line
-from drakegrasp.frames import Array, make_pose
+from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import even_points
 from drakegrasp.hand.parsing import Chain, add_model, find_joints, make_chains
 from drakegrasp.hand.shapes import hull_triangles, shape_corners
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.reach.arm import TABLE_SIZE, Arm
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.seeding import Stream
@@ -49,7 +50,7 @@ logging.getLogger("drake").addFilter(
 SPACING = 0.01
 #: Number of drawn configurations in which links collide that overlap by construction.
 DRAWS = 50
-#: Largest distance from the table that is measured [m]; it counts as no more than this.
+#: Largest distance from table and walls that is measured [m]; it counts as no more than this.
 FARTHEST = 0.2
 #: Points nearer to an object than this get an exact distance [m].
 NEAR = 0.01
@@ -63,7 +64,7 @@ FIRST = np.zeros(1, dtype=np.int64)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cell:
-    """An arm with a joints, a hand with j joints, and the table.
+    """An arm with a joints, a hand with j joints, the table, and walls on it.
 
     Attributes:
         arm: The arm.
@@ -71,7 +72,7 @@ class Cell:
         X_FG: (4, 4), palm frame on the flange.
         chain: The joints of the arm, from {T} to the flange.
         limits: (a, 2), their limits [rad or m].
-        checker: Drake's checker of links and table.
+        checker: Drake's checker of links, table and walls.
         hand_joints: Names of the hand's joints, in the order of every `q`.
         arm_columns, hand_columns: Places of the joints of arm and hand in Drake's positions.
         points: Points (n, 3) on each link of the arm, by its index in the plant [m].
@@ -95,11 +96,11 @@ class Cell:
         return found
 
     def is_free(self, q: Array, q_hand: Array) -> bool:
-        """Return whether no link touches the table or another link."""
+        """Return whether no link touches the table, a wall or another link."""
         return bool(self.checker.CheckConfigCollisionFree(self.positions(q, q_hand)))
 
     def table_distance(self, q: Array, q_hand: Array) -> float:
-        """Return the distance [m] of the moving links from the table, at most FARTHEST."""
+        """Return the distance [m] of the moving links from table and walls, at most FARTHEST."""
         positions = self.positions(q, q_hand)
         found = self.checker.CalcRobotClearance(positions, FARTHEST)
         table = self.checker.plant().world_body().index()
@@ -131,22 +132,32 @@ class Cell:
         return np.concatenate(found)
 
 
-def make_cell(arm: Arm, source: HandSource, X_FB: Array) -> Cell:
+def make_cell(
+    arm: Arm, source: HandSource, X_FB: Array, around: Neighbourhood | None = None
+) -> Cell:
     """Return an arm with a hand at the table; a process keeps the last ones.
 
     Args:
         arm: The arm.
         source: The hand, see `load_hand`.
         X_FB: Pose (4, 4) of the hand's palm link on the flange.
+        around: What is around the object; its boxes are walls of the cell.
 
     Raises:
-        ConfigError: If Drake cannot use the arm.
+        ConfigError: If Drake cannot use the arm, or its base is in a wall.
     """
-    return _cell(arm, source, np.asarray(X_FB, dtype=float).tobytes())
+    walls = tuple((_bits(b.size), _bits(b.X_TB)) for b in around.boxes) if around else ()
+    return _cell(arm, source, _bits(X_FB), walls)
+
+
+def _bits(array: Array) -> bytes:
+    return np.asarray(array, dtype=float).tobytes()
 
 
 @lru_cache(maxsize=KEPT)
-def _cell(arm: Arm, source: HandSource, mount: bytes) -> Cell:
+def _cell(
+    arm: Arm, source: HandSource, mount: bytes, walls: tuple[tuple[bytes, bytes], ...]
+) -> Cell:
     hand, X_FB = load_hand(source), np.frombuffer(mount).reshape(4, 4)
     with allow_network("package_map"):
         builder = RobotDiagramBuilder(time_step=0.0)
@@ -154,7 +165,7 @@ def _cell(arm: Arm, source: HandSource, mount: bytes) -> Cell:
     instance, hand_instance = _add_arm(plant, builder.parser(), arm), add_model(plant, hand.model)
     joints, welded = find_joints(plant, instance), plant.WeldFrames
 
-    # The first link in {T}, the hand on the flange, and the slab of the table.
+    # The first link in {T}, the hand on the flange, the slab of the table, and the walls.
     first = plant.get_body(plant.GetBodyIndices(instance)[0])
     welded(plant.world_frame(), first.body_frame(), RigidTransform(arm.X_TA))
     flange = plant.GetFrameByName(arm.flange, instance)
@@ -162,6 +173,9 @@ def _cell(arm: Arm, source: HandSource, mount: bytes) -> Cell:
     welded(flange, palm, RigidTransform(X_FB))
     X_TS = RigidTransform(make_pose(np.eye(3), [0.0, 0.0, -TABLE_SIZE[2] / 2.0]))
     _add_shape(plant, plant.world_body(), X_TS, Box(*TABLE_SIZE), "table")
+    boxes = [(np.frombuffer(size), np.frombuffer(X).reshape(4, 4)) for size, X in walls]
+    for number, (size, X_TB) in enumerate(boxes):
+        _add_shape(plant, plant.world_body(), RigidTransform(X_TB), Box(size), f"wall_{number}")
     plant.Finalize()
 
     chain = _chain_of(joints, first, arm)
@@ -185,6 +199,10 @@ def _cell(arm: Arm, source: HandSource, mount: bytes) -> Cell:
         points=_points(checker),
     )
     _leave_out_overlaps(cell)
+    for size, X_TB in boxes:
+        p_BQ = transform_points(invert_pose(X_TB) @ arm.X_TA, cell.points[first.index()])
+        if (np.abs(p_BQ) < size / 2.0).all(axis=1).any():
+            raise ConfigError(f"base must be clear of the walls, got {first.name()!r} in one")
     return cell
 
 
@@ -258,6 +276,7 @@ def _leave_out_overlaps(cell: Cell) -> None:
         if j == plant.world_body().index():
             link = plant.get_body(i).name()
             raise ConfigError(
-                f"base must leave the arm clear of the table, got {link!r} in it wherever it moves"
+                f"base must leave the arm clear of table and walls, got {link!r} in them "
+                "wherever it moves"
             )
         checker.SetCollisionFilteredBetween(i, j, True)

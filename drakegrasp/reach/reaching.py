@@ -6,12 +6,16 @@ pose, closes there, and goes straight to the end of the trial's lift, with the o
 must do all of it in one branch of its inverse kinematics, without a jump, within its joint limits
 and without a collision. How it comes to the start of the approach is not planned.
 
-The hand's own way along the approach does not depend on the arm, and is decided first.
+The hand's own way along the approach does not depend on the arm, and is decided first. Neighbours
+stay where they are. Whether the closed hand or the carried object pushes them is a question of the
+trial.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,13 +28,14 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.finger_sweep import link_points
 from drakegrasp.hand.kinematics import posed_links
 from drakegrasp.mesh.distance_field import DistanceField
+from drakegrasp.objects.surroundings import Neighbourhood
 from drakegrasp.reach.arm import Arm, mount_of
 from drakegrasp.reach.branches import find_branches, follow
 from drakegrasp.reach.cell import FIRST, NEAR, Cell, make_cell
 from drakegrasp.runtime.environment import one_thread
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.placement import canonical_pose
-from drakegrasp.simulation.screen import COVERED, PointLookup
+from drakegrasp.simulation.screen import PointLookup, extra_margin
 
 #: Length of the straight approach [m].
 APPROACH = 0.10
@@ -38,9 +43,11 @@ APPROACH = 0.10
 STEP, HAND_STEP = 0.02, 0.005
 #: Largest motion of a joint in a step of a path [rad or m]: at 0.1 m/s it is 1.5 rad/s.
 JUMP = 0.3
-#: An open hand that is deeper in object or table than this collides on its way [m]. It is the
-#: margin with which attempts are screened, see `ScreenConfig.start_margin`.
+#: An open hand that is deeper in an object or the table than this collides on its way [m]. It is
+#: the margin with which attempts are screened, see `ScreenConfig.start_margin`.
 HAND_MARGIN = 0.0025
+#: Objects that an arm may hit: the distances from each in its own frame, and its pose (4, 4).
+Solids: TypeAlias = Sequence[tuple[DistanceField, Array]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,6 +59,8 @@ class Grasp:
         X_TG: Pose (4, 4) of the palm at the grasp.
         q_open, q_closed: (j,), joints of the hand before and after closing [rad or m].
         p_TG_lifted: (3,), where the lift takes the palm's origin [m].
+        around: What is around the object; its walls are those of the cell. None for an object that
+            is alone.
     """
 
     X_TO: Array
@@ -59,6 +68,7 @@ class Grasp:
     q_open: Array
     q_closed: Array
     p_TG_lifted: Array
+    around: Neighbourhood | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,8 +79,8 @@ class Reach:
         outcome: One of REACHES: that of the branch which comes farthest.
         q: (3, a), joints at the start of the approach, at the grasp and at the end of the lift;
             NaN if the grasp is not reachable.
-        clearance: Least distance [m] of arm and hand from the table, and of the arm and the open
-            hand from the object, all the way; at most `cell.FARTHEST`. NaN if not reachable.
+        clearance: Least distance [m] of arm and hand from table and walls, and of the arm and the
+            open hand from all objects, all the way; at most `cell.FARTHEST`. NaN if not reachable.
     """
 
     outcome: str
@@ -87,12 +97,16 @@ def reach_grasp(cell: Cell, field: DistanceField, grasp: Grasp) -> Reach:
     """Return what an arm can do about a grasp.
 
     Args:
-        cell: The arm and its hand.
+        cell: The arm and its hand, and the walls around the object.
         field: Distances from the object in {O}.
         grasp: The grasp.
     """
-    room = _room_of_hand(cell, field, grasp)
-    if room < -HAND_MARGIN - max(0.0, field.blur - COVERED):
+    around = grasp.around or Neighbourhood(X_TN=np.zeros((0, 4, 4)))
+    beside = [(model.field, X) for model, X in zip(around.models, around.X_TN, strict=True)]
+    at_rest = [(field, grasp.X_TO), *beside]
+    rooms = [_room_of_hand(cell, *solid, grasp) for solid in at_rest]
+    allowed = [-HAND_MARGIN - extra_margin(solid) for solid, _ in at_rest]
+    if any(room < least for room, least in zip(rooms, allowed, strict=True)):
         return _unreachable(cell, "approach")
 
     # All branches of the grasp itself, and those that collide with nothing.
@@ -103,8 +117,7 @@ def reach_grasp(cell: Cell, field: DistanceField, grasp: Grasp) -> Reach:
     free = [
         q
         for q in branches
-        if _is_free(cell, field, q, grasp.q_open, grasp.X_TO)
-        and _is_free(cell, field, q, grasp.q_closed, grasp.X_TO)
+        if _is_free(cell, at_rest, q, grasp.q_open) and _is_free(cell, at_rest, q, grasp.q_closed)
     ]
     if not free:
         return _unreachable(cell, "collision")
@@ -114,24 +127,24 @@ def reach_grasp(cell: Cell, field: DistanceField, grasp: Grasp) -> Reach:
     approach, approaches = follow(cell.chain, cell.limits, back @ X_GF, np.array(free), JUMP)
     lift, lifts = follow(cell.chain, cell.limits, up @ X_GF, np.array(free), JUMP)
     farthest = "approach"
-    carried = up @ invert_pose(grasp.X_TG) @ grasp.X_TO
+    carried = [[(field, X), *beside] for X in up @ invert_pose(grasp.X_TG) @ grasp.X_TO]
     for i, q in enumerate(free):
         if not approaches[i] or not all(
-            _is_free(cell, field, row, grasp.q_open, grasp.X_TO) for row in approach[:, i]
+            _is_free(cell, at_rest, row, grasp.q_open) for row in approach[:, i]
         ):
             continue
         farthest = "lift"
         if lifts[i] and all(
-            _is_free(cell, field, row, grasp.q_closed, X_TO)
-            for row, X_TO in zip(lift[:, i], carried, strict=True)
+            _is_free(cell, solids, row, grasp.q_closed)
+            for row, solids in zip(lift[:, i], carried, strict=True)
         ):
-            way = [(row, grasp.q_open, grasp.X_TO) for row in (*approach[:, i], q)]
-            way += [(q, grasp.q_closed, grasp.X_TO)]
-            way += [(row, grasp.q_closed, X) for row, X in zip(lift[:, i], carried, strict=True)]
+            way = [(at_rest, row, grasp.q_open) for row in (*approach[:, i], q)]
+            way += [(at_rest, q, grasp.q_closed)]
+            way += [(s, row, grasp.q_closed) for row, s in zip(lift[:, i], carried, strict=True)]
             return Reach(
                 outcome=REACHES[0],
                 q=np.stack([approach[-1, i], q, lift[-1, i]]),
-                clearance=min(room, *(_clearance(cell, field, *state) for state in way)),
+                clearance=min(*rooms, *(_clearance(cell, *state) for state in way)),
             )
     return _unreachable(cell, farthest)
 
@@ -146,6 +159,7 @@ def reach_attempt(
     *,
     q_closed: Array | None = None,
     X_TO_simulated: Array | None = None,
+    around: Neighbourhood | None = None,
 ) -> Reach:
     """Return what an arm can do about an attempt, wherever its object is on the table.
 
@@ -158,12 +172,13 @@ def reach_attempt(
         q_closed: (j,), joints of the closed hand [rad or m]; None for those of the open hand.
         X_TO_simulated: Pose (4, 4) of the object in a simulation, relative to which the lift goes;
             None for the middle of the table, without yaw.
+        around: What is around the object at X_TO.
 
     Raises:
-        ConfigError: If the arm does not carry the hand.
+        ConfigError: If the arm does not carry the hand, or stands in a wall.
     """
     hand = load_hand(config.hand_source)
-    cell = make_cell(arm, config.hand_source, mount_of(arm, hand))
+    cell = make_cell(arm, config.hand_source, mount_of(arm, hand), around)
     q_open = open_joints(attempt, hand, cell.hand_joints)
     middle = canonical_pose(X_TO) if X_TO_simulated is None else X_TO_simulated
     moved = X_TO @ invert_pose(middle)
@@ -173,6 +188,7 @@ def reach_attempt(
         q_open=q_open,
         q_closed=q_open if q_closed is None else q_closed,
         p_TG_lifted=moved[:3, :3] @ config.lift.p_TG + moved[:3, 3],
+        around=around,
     )
     return reach_grasp(cell, field, grasp)
 
@@ -208,8 +224,8 @@ def lift_path(grasp: Grasp) -> Array:
     return path
 
 
-def _room_of_hand(cell: Cell, field: DistanceField, grasp: Grasp) -> float:
-    """Return the least distance [m] of the open hand from object and table on its approach."""
+def _room_of_hand(cell: Cell, field: DistanceField, X_TO: Array, grasp: Grasp) -> float:
+    """Return the least distance [m] of the open hand from an object and the table on its way."""
     names = cell.hand_joints
     positions = {n: np.asarray(q) for n, q in zip(names, grasp.q_open.tolist(), strict=True)}
     surfaces = link_points(cell.hand)
@@ -220,26 +236,27 @@ def _room_of_hand(cell: Cell, field: DistanceField, grasp: Grasp) -> float:
         ]
     ).astype(np.float32)
     X_TG = approach_path(grasp, HAND_STEP)
-    X_TO = np.broadcast_to(grasp.X_TO, X_TG.shape)
-    lookup = PointLookup(field, X_TO, invert_pose(grasp.X_TO) @ X_TG)
+    lookup = PointLookup(field, np.broadcast_to(X_TO, X_TG.shape), invert_pose(X_TO) @ X_TG)
     rows = np.arange(len(lookup))
     to_object = lookup.distances(rows, p_GQ, NEAR)
     return float(min(to_object.min(), lookup.heights(rows, p_GQ).min()))
 
 
-def _is_free(cell: Cell, field: DistanceField, q: Array, q_hand: Array, X_TO: Array) -> bool:
-    return cell.is_free(q, q_hand) and _from_object(cell, field, q, q_hand, X_TO) > 0.0
+def _is_free(cell: Cell, solids: Solids, q: Array, q_hand: Array) -> bool:
+    return cell.is_free(q, q_hand) and _from_solids(cell, solids, q, q_hand) > 0.0
 
 
-def _from_object(cell: Cell, field: DistanceField, q: Array, q_hand: Array, X_TO: Array) -> float:
-    """Return the distance [m] of the arm, without the hand, from the object."""
-    lookup = PointLookup(field, X_TO[None], invert_pose(X_TO)[None])
+def _from_solids(cell: Cell, solids: Solids, q: Array, q_hand: Array) -> float:
+    """Return the distance [m] of the arm, without the hand, from the nearest object."""
     points = cell.arm_points(q, q_hand).astype(np.float32)
-    return float(lookup.distances(FIRST, points, NEAR).min())
+    return min(
+        float(PointLookup(f, X[None], invert_pose(X)[None]).distances(FIRST, points, NEAR).min())
+        for f, X in solids
+    )
 
 
-def _clearance(cell: Cell, field: DistanceField, q: Array, q_hand: Array, X_TO: Array) -> float:
-    return min(cell.table_distance(q, q_hand), _from_object(cell, field, q, q_hand, X_TO))
+def _clearance(cell: Cell, solids: Solids, q: Array, q_hand: Array) -> float:
+    return min(cell.table_distance(q, q_hand), _from_solids(cell, solids, q, q_hand))
 
 
 def _unreachable(cell: Cell, outcome: str) -> Reach:

@@ -23,7 +23,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.scenes import SceneDataset, SceneRows
-from drakegrasp.errors import ConfigError, GraspError, TooLittleSeenError
+from drakegrasp.errors import GraspError, TooLittleSeenError
 from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import invert_pose, unpack_pose
 from drakegrasp.hand.description import Hand, load_hand
@@ -157,7 +157,8 @@ def predict_scenes(
     """Return grasps for all views of a split, in the frames of their objects.
 
     The rows of the views are those of `drakegrasp score`, see `dataset.scenes.SceneRows`. Among
-    other objects, lifts are tried among those that the view shows, completed from it.
+    other objects, lifts are tried and arms are asked among those that the view shows, completed
+    from it.
 
     Args:
         path: OUT/scenes.hdf5 or OUT/clutter.hdf5.
@@ -176,13 +177,11 @@ def predict_scenes(
     Raises:
         DataError: If the file cannot be used.
         GraspError: If no view yields a posture, or a view is invalid.
-        ConfigError: If an override is invalid, or an arm is given with several objects.
+        ConfigError: If an override is invalid.
     """
     data = SceneDataset(path, points=None, split=split, negatives="none", balance="view", grasps=1)
     if not len(data):
         raise GraspError(f"{path}: {data.emptiness}")
-    if data.several and arm is not None:
-        raise ConfigError(f"arm must be None for scenes of several objects, got {arm.name}")
     rows = SceneRows(path, split=split) if data.several else None
     views = list(data.views.tolist() if rows is None else rows.views.tolist())
     places = [0] * len(views) if rows is None else rows.places.tolist()
@@ -252,7 +251,7 @@ def _predict_view(
     view = seen.view
     try:
         cloud, around = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC), None
-        if seen.instances is not None and simulate:
+        if seen.instances is not None and (simulate or arm is not None):
             around = seen_neighbours(view, seen.instances, seen.boxes, config)
         how: dict[str, Any] = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
         found, _ = predict(cloud, view, config, **how, around=around)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -164,8 +165,8 @@ def rank(
         config: Mass of the object, friction and all rules of the lifts; None for the preset `fast`.
         arm: An arm, see `load_arm`. It is asked for all proposals, with the convex hull of the
             points as the object, which takes about 0.1 s each.
-        around: Neighbours and walls in {T}, see `seen_neighbours`, among which lifts are tried;
-            closing on points does not know them.
+        around: Neighbours and walls in {T}, see `seen_neighbours`, among which lifts are tried and
+            the arm is asked; closing on points does not know them.
 
     Raises:
         GraspError: If the cloud, the poses, the spread or the view are invalid, postures are in {O}
@@ -176,12 +177,7 @@ def rank(
     """
     if simulate < 0:
         raise GraspError(f"simulate must be a whole number, 0 or more, got {simulate}")
-    if view is not None:
-        if len(view) != len(View._fields):
-            raise GraspError(f"view must be {', '.join(View._fields)}, got {len(view)} values")
-        view = View(*view)
-        cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
-    points = read_cloud(cloud)
+    view, points = _read_view(view), read_cloud(cloud)
     hand = load_hand(config.hand_source) if hand is None and config else chosen_hand(hand)
     proposals = _read_proposals(proposals, hand, spread)
     starts = _starts(proposals, hand, spread)
@@ -205,9 +201,8 @@ def rank(
     reach, behind = tuple[Reach | None, ...](), np.zeros(len(score), dtype=np.bool_)
     if arm is not None:
         rules = lifting_config(hand, config)
-        found = {i: _reach(arm, s, solids[0], proposals, i, rules) for i, s in starts.items()}
-        reach = tuple(found.get(i) for i in range(len(score)))
-        behind = ~np.array([each is not None and each.reachable for each in reach])
+        reach = _reaches(arm, proposals, starts, solids[0], rules, around)
+        behind = np.array([each is None or not each.reachable for each in reach])
     return Ranking(
         score=score,
         order=np.lexsort((-chance, behind)),
@@ -220,21 +215,37 @@ def rank(
     )
 
 
-def _reach(
-    arm: Arm, start: Attempt, solid: Solid, proposals: GraspTable | Array, i: int, config: Config
-) -> Reach:
-    """Return what an arm can do about proposal i, on the solid in {T}."""
-    q = proposals.q_grasp[i] if isinstance(proposals, GraspTable) else np.array([np.nan])
+def _read_view(view: View | Sequence[npt.ArrayLike] | None) -> View | None:
+    """Return a view whose depth image, mask and camera fit together.
+
+    Raises:
+        GraspError: If they do not.
+    """
+    if view is None:
+        return None
+    if len(view) != len(View._fields):
+        raise GraspError(f"view must be {', '.join(View._fields)}, got {len(view)} values")
+    view = View(*view)
+    cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
+    return view
+
+
+def _reaches(
+    arm: Arm,
+    proposals: GraspTable | Array,
+    starts: Mapping[int, Attempt],
+    solid: Solid,
+    config: Config,
+    around: Neighbourhood | None,
+) -> tuple[Reach | None, ...]:
+    """Return what an arm can do about each proposal, on the solid in {T}; None without a start."""
+    q_closed = dict[int, Array]()
+    if isinstance(proposals, GraspTable):
+        q_closed = {i: q for i, q in enumerate(proposals.q_grasp) if not np.isnan(q).any()}
     middle = make_pose(np.eye(3), [-solid.middle[0], -solid.middle[1], 0.0])
-    return reach_attempt(
-        arm,
-        solid.field,
-        start,
-        np.eye(4),
-        config,
-        q_closed=None if np.isnan(q).any() else q,
-        X_TO_simulated=middle,
-    )
+    ask = partial(reach_attempt, arm, solid.field, X_TO_simulated=middle, around=around)
+    found = {i: ask(s, np.eye(4), config, q_closed=q_closed.get(i)) for i, s in starts.items()}
+    return tuple(found.get(i) for i in range(len(proposals)))
 
 
 def measured(

@@ -292,7 +292,8 @@ class Verification:
             return self
         closed, about = self.first.trial.closed, (self.placed.model.field, self.first.pregrasp)
         q_closed = None if closed is None else closed.q
-        reach = reach_attempt(arm, *about, self.placed.X_TO, self.config, q_closed=q_closed)
+        X_TO, around = self.placed.X_TO, self.placed.around
+        reach = reach_attempt(arm, *about, X_TO, self.config, q_closed=q_closed, around=around)
         return replace(self, arm=arm, reach=reach)
 
     def findings(self) -> dict[str, Any]:

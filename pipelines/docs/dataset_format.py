@@ -34,6 +34,7 @@ OUT/
   grasping_oto.hdf5        samples; the camera is rolled with the palm
   grasping_otm.hdf5        the same samples; up in the image is up in the world
   reach/NAME.hdf5          which samples an arm reaches; on request
+  reach/clutter/NAME.hdf5  which free grasps of clutter.hdf5 it reaches; on request
   scenes.hdf5              views that do not depend on a grasp, and all closed hands; on request
   clutter.hdf5             the same for scenes of several objects; on request
   reject.json              grasps that an inspection rejects; only if there are any
@@ -177,6 +178,15 @@ number of its joints.
 ### /reach
 """
 
+_CLUTTER_REACH = """
+## reach/clutter/NAME.hdf5
+
+`drakegrasp reach --clutter` writes the same for the free grasps of `clutter.hdf5`, whose attributes
+`signature` and `clutter` it has, too.
+
+### /clutter
+"""
+
 _VERIFICATION = """
 ## The results of `drakegrasp verify`
 
@@ -222,6 +232,7 @@ _TABLES = (
     ("\n### /objects of scenes.hdf5\n", schema.SCENE_OBJECT_FIELDS, False),
     (_REACH, schema.REACH_FIELDS, False),
     ("\n### /shapes\n", schema.SHAPE_FIELDS, False),
+    (_CLUTTER_REACH, schema.CLUTTER_REACH_FIELDS, False),
     (_SHARDS, schema.LOOK_FIELDS, False),
     (_VERIFICATION, schema.VERIFICATION_FIELDS, True),
     (_ROWS, schema.PREDICTED_ROW_FIELDS, False),

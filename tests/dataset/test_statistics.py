@@ -125,6 +125,7 @@ def test_grasps_among_others_are_counted_by_surroundings(
                 "tried": int((own & tried).sum()),
                 "neighbour_hit": int((own & (grasps["outcome"] == 19)).sum()),
                 **{label: int((own & grasps[label]).sum()) for label in LABELS},
+                "reachable": {},
             }
         )
     assert due[1]["grasps"] > due[1]["free"] >= due[1]["tried"] > due[1]["kept"] > 0

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from helpers.objects import box_model
 
+from drakegrasp.errors import ConfigError
 from drakegrasp.frames import Array, invert_pose, make_pose, rotation_about, rotation_angle
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.surroundings import Box, Neighbourhood
 from drakegrasp.reach.arm import load_arm, mount_of, mount_pose
 from drakegrasp.reach.branches import find_branches, flange_poses, follow
 from drakegrasp.reach.cell import Cell, make_cell
-from drakegrasp.reach.reaching import Grasp, approach_path, lift_path, reach_grasp
+from drakegrasp.reach.reaching import Grasp, Reach, approach_path, lift_path, reach_grasp
 
 #: Height of the box [m].
 HEIGHT = 0.1
@@ -220,3 +222,77 @@ def test_the_object_moves_with_the_hand(six: Path, tmp_path: Path) -> None:
             p_TG_lifted=np.array([0.19, 0.0, height]),
         )
         assert reach_grasp(cell, plate.field, grasp).outcome == outcome
+
+
+def wall(x: float, height: float) -> Box:
+    """Return a wall of 10 cm across the table."""
+    size = np.array([0.1, 1.6, height])
+    return Box(size=size, X_TB=make_pose(np.eye(3), [x, 0.0, height / 2.0]))
+
+
+def around_of(*boxes: Box, neighbours: dict[ObjectModel, Array] | None = None) -> Neighbourhood:
+    """Return boxes, and neighbours by their positions."""
+    found = neighbours or {}
+    X_TN = [make_pose(np.eye(3), p_TN) for p_TN in found.values()]
+    return Neighbourhood(
+        models=tuple(found), X_TN=np.array(X_TN).reshape(-1, 4, 4), boxes=tuple(boxes)
+    )
+
+
+def reach_among(
+    six: Path,
+    box: ObjectModel,
+    around: Neighbourhood | None,
+    base: tuple[float, ...] = BASE,
+    **changes: object,
+) -> Reach:
+    """Return what an arm can do about the grasp from above."""
+    arm = load_arm(six, base)
+    cell = make_cell(arm, "barrett", mount_of(arm, load_hand()), around)
+    return reach_grasp(cell, box.field, top_grasp(cell, around=around, **changes))
+
+
+def test_a_wall_in_the_way_of_the_arm(six: Path, box: ObjectModel) -> None:
+    free, beside = reach_among(six, box, None), reach_among(six, box, around_of(wall(0.6, 0.3)))
+    assert free.reachable
+    np.testing.assert_array_equal(beside.q, free.q)
+    assert beside.clearance == free.clearance
+
+    # Nothing gets past a high wall, unless the arm stands on the other side of it.
+    high = around_of(wall(-0.25, 1.2))
+    assert reach_among(six, box, high).outcome == "collision"
+    assert reach_among(six, box, high, (0.5, 0.0, 0.0, 0.3)).reachable
+    # A low wall is passed, and the arm comes nearer to it than to the table.
+    low = reach_among(six, box, around_of(wall(-0.15, 0.1)))
+    assert low.reachable
+    assert low.clearance < free.clearance
+    with pytest.raises(ConfigError, match="base must be clear of the walls, got 'base' in one"):
+        reach_among(six, box, around_of(wall(-0.45, 0.05)))
+
+
+def test_a_neighbour_in_the_way_of_arm_or_hand(six: Path, box: ObjectModel, tmp_path: Path) -> None:
+    (tmp_path / "high").mkdir()
+    high = box_model(tmp_path / "high", [0.1, 1.2, 1.2])
+    post = box_model(tmp_path, [0.04, 0.04, 0.3])
+    free = reach_among(six, box, None)
+    for neighbours, outcome in (
+        ({high: [-0.25, 0.0, 0.6]}, "collision"),
+        ({post: [0.0, 0.09, 0.15]}, "approach"),
+        ({post: [0.4, 0.3, 0.15]}, "reachable"),
+        ({post: [0.4, 0.3, 0.15], high: [-0.25, 0.0, 0.6]}, "collision"),
+    ):
+        found = reach_among(six, box, around_of(neighbours=neighbours))
+        assert found.outcome == outcome
+    far = reach_among(six, box, around_of(neighbours={post: [0.4, 0.3, 0.15]}))
+    np.testing.assert_array_equal(far.q, free.q)
+
+
+def test_a_neighbour_stays_when_the_object_is_lifted(
+    six: Path, box: ObjectModel, tmp_path: Path
+) -> None:
+    """A beam above the arm is hit by the lift alone."""
+    beam = around_of(neighbours={box_model(tmp_path, [0.06, 1.0, 0.06]): [-0.25, 0.0, 0.7]})
+    for height, outcome in ((0.4, "reachable"), (0.6, "lift")):
+        up = np.array([0.0, 0.0, height])
+        assert reach_among(six, box, None, p_TG_lifted=up).reachable
+        assert reach_among(six, box, beam, p_TG_lifted=up).outcome == outcome

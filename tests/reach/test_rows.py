@@ -343,7 +343,10 @@ BAD_OPTIONS = {
     "flange must be a link of six.urdf, got 'tool'": ("--flange", "tool"),
     "base must be on the table, z >= 0, or beside it, |x| or |y| >= 0.8 m, got x=0.1, y=0, "
     "z=-0.05 inside of it": ("--base", "0.1,0,-0.05,0"),
-    "base must leave the arm clear of the table, got 'shoulder'": ("--base", "-0.81,0,-0.12,0"),
+    "base must leave the arm clear of table and walls, got 'shoulder'": (
+        "--base",
+        "-0.81,0,-0.12,0",
+    ),
     "--base must be 4 numbers with commas, got '1,2'": ("--base", "1,2"),
     "--mount must be 6 numbers with commas, got 'a'": ("--mount", "a"),
     "the name of an object must be": ("--name", "../x"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -197,9 +196,3 @@ def test_a_neighbour_in_the_way_counts_if_grasps_are_lifted(
         there = type(around)(models=around.models, X_TN=X)
         found = dg.rank(one, cloud, simulate=1, view=own, config=config, around=there)
         assert (found.share[0] > 0.0) == (share > 0.0)
-
-
-@pytest.mark.sim
-def test_arms_are_refused(rows: SceneRows) -> None:
-    with pytest.raises(dg.ConfigError, match=r"arm must be None for scenes of .*, got x"):
-        predict_scenes(rows.path, arm=SimpleNamespace(name="x"))  # type: ignore[arg-type]
