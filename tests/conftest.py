@@ -27,8 +27,8 @@ from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.runtime.executor import run_here
+from drakegrasp.simulation.fixtures import load_surroundings
 
 # Software OpenGL must not start threads beside the test workers, and nothing needs the network.
 os.environ.setdefault("LP_NUM_THREADS", "0")

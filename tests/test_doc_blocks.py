@@ -26,7 +26,7 @@ from drakegrasp.dataset.rejections import Decisions, write_decisions
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.objects.surroundings import load_surroundings
+from drakegrasp.simulation.fixtures import load_surroundings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -147,11 +147,15 @@ def test_yaml_blocks_are_read(tmp_path: Path) -> None:
             assert (source.name, source.class_name, source.up, source.licence) == tuple(
                 said[key] for key in ("name", "class", "up", "licence")
             )
-        elif "boxes" in content:
+        elif "extent" in content:
             kinds.append("surroundings")
             path = tmp_path / "mine.yaml"
             path.write_text(block.text, encoding="utf-8")
-            assert load_surroundings(path).tree() == content
+            if "model" in content:
+                (model,) = (b for b in BLOCKS if b.page == block.page and b.language == "xml")
+                (tmp_path / content.pop("model")).write_text(model.text, encoding="utf-8")
+            own = load_surroundings(path)
+            assert {key: own.tree()[key] for key in content} == content and own.boxes
         elif "fingers" in content:
             kinds.append("hand")
         else:
@@ -159,7 +163,7 @@ def test_yaml_blocks_are_read(tmp_path: Path) -> None:
             path = tmp_path / "mine.yaml"
             path.write_text(block.text, encoding="utf-8")
             assert load_config(str(path)).to_dict() != load_config().to_dict()
-    assert sorted(kinds) == ["config", "hand", "objects", "surroundings"]
+    assert sorted(kinds) == ["config", "hand", "objects", *["surroundings"] * 2]
 
 
 def meshes(folder: Path) -> Path:

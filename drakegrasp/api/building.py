@@ -31,7 +31,7 @@ from drakegrasp.generation.pipeline import BuildReport, build
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.objects.surroundings import Surroundings, load_surroundings
+from drakegrasp.objects.surroundings import Surroundings
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring import clutter_benchmark
@@ -39,6 +39,7 @@ from drakegrasp.scoring.benchmark import NAME, PRESET, write_objects
 from drakegrasp.scoring.clutter_benchmark import ClutterFacts
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.attempts import GraspTable, unknown_objects
+from drakegrasp.simulation.fixtures import load_surroundings
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -337,8 +338,8 @@ def build_clutter(
         out: Directory of a dataset with samples.
         scenes: Number of scenes.
         objects: Smallest and largest number of objects of a scene.
-        surroundings: table, bin, shelf, a YAML file of boxes, or several of these, which scenes
-            take in turn.
+        surroundings: table, bin, shelf, a YAML file of boxes, a model of Drake (.sdf, .urdf,
+            .dmd.yaml), or several of these, which scenes take in turn.
         tries: Number of grasps of each scene, among those that geometry calls free, that are tried.
         client: A Dask client whose workers do the work, e.g. from `connect`.
         show: Whether to show progress on standard error.

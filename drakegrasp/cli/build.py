@@ -144,7 +144,7 @@ def clutter(
     *,
     scenes: Positive = 50,
     objects: Annotated[str, Parameter(metavar="N|N..M")] = "2..6",
-    surroundings: Annotated[tuple[str, ...], Parameter(metavar="NAME|YAML")] = (),
+    surroundings: Annotated[tuple[str, ...], Parameter(metavar="NAME|YAML|MODEL")] = (),
     tries: Count = 10,
     quiet: bool = False,
     workers: Workers = Workers(),
@@ -160,8 +160,8 @@ def clutter(
         out: Directory of the dataset.
         scenes: Number of scenes.
         objects: Number of objects of a scene, or its range.
-        surroundings: table, bin, shelf, or a YAML file of boxes; given several times, scenes take
-            them in turn. [default: table]
+        surroundings: table, bin, shelf, a YAML file of boxes, or a model of Drake (.sdf, .urdf,
+            .dmd.yaml); given several times, scenes take them in turn. [default: table]
         tries: Number of free grasps of each scene that are tried.
         quiet: Show no progress.
     """

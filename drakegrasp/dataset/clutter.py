@@ -20,9 +20,9 @@ from drakegrasp.foreign_files import parse_json
 from drakegrasp.frames import Array, invert_pose, unpack_pose
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.surroundings import (
+    BUILT_IN,
     Neighbourhood,
     Surroundings,
-    load_surroundings,
     surroundings_of,
 )
 from drakegrasp.simulation.placement import PlacedObject, aligned_pose
@@ -75,7 +75,7 @@ class Clutter:
 
     def around(self, i: int) -> Neighbourhood:
         """Return what is around object i."""
-        return Neighbourhood.of(i, self.models, self.X_TO, self.surroundings.boxes)
+        return Neighbourhood.of(i, self.models, self.X_TO, self.surroundings.walls)
 
     def simulated(self, i: int) -> tuple[Array, Neighbourhood]:
         """Return the pose (4, 4) at which object i is simulated, and what is around it there."""
@@ -128,7 +128,7 @@ def load_scene(path: str | Path, number: int) -> Clutter:
     return Clutter(
         names=names,
         X_TO=unpack_pose(scenes["X_TO"][number, : len(names)]),
-        surroundings=surroundings_in(path)[around] if several else load_surroundings("table"),
+        surroundings=surroundings_in(path)[around] if several else BUILT_IN["table"],
         config=config,
         prepared=tuple(prepared[name] for name in names),
     )

@@ -215,7 +215,7 @@ class _Scene:
         lens = Lens.of(config.scenes)
         renderer = build_renderer(self._models[0], config.camera, around)
         bare = Neighbourhood(models=around.models, X_TN=around.X_TN)
-        alone = build_renderer(self._models[0], config.camera, bare) if around.boxes else renderer
+        alone = build_renderer(self._models[0], config.camera, bare) if around.walls else renderer
         look = usual_appearance(self._models[0].name)
 
         images: dict[str, list[bytes]] = {name: [] for name in IMAGES}

@@ -443,9 +443,15 @@ def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) ->
     return "\n".join(lines) + "\n"
 
 
+def convex_hull(corners: npt.ArrayLike) -> Solid:
+    """Return the convex hull of corners (n, 3) [m]."""
+    hull = trimesh.convex.convex_hull(np.asarray(corners, dtype=float))
+    return Solid(vertices=np.asarray(hull.vertices), faces=np.asarray(hull.faces))
+
+
 def hull_text(corners: npt.ArrayLike) -> str:
     """Return the convex hull of corners (n, 3) as Wavefront text, with its faces turned outward."""
-    hull = trimesh.convex.convex_hull(np.asarray(corners, dtype=float))
+    hull = convex_hull(corners)
     return obj_text(hull.vertices, hull.faces, normals=False)
 
 

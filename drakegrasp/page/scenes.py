@@ -22,6 +22,7 @@ from drakegrasp.dataset.schema import (
 )
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
+from drakegrasp.mesh.surfaces import convex_hull
 from drakegrasp.objects.surroundings import BUILT_IN
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.gallery import Gallery, Places, Query
@@ -368,9 +369,9 @@ class Clutter(Scenes):
         return FREE if has["free"] else HITS
 
     def _scene(self, i: int, grasps: Rows, hand: HandView) -> dict[str, Any]:
-        """Return the 3D view, with the neighbours of the first object and the boxes."""
+        """Return the 3D view, with the neighbours of the first object and the walls."""
         poses = unpack_pose(self.data.tables["scenes"]["X_TO"][i])
-        boxes = self.around[self.data.tables["scenes"]["surroundings"][i]].boxes
+        walls = self.around[self.data.tables["scenes"]["surroundings"][i]].walls
         numbers = self._numbers(i)
         return super()._scene(i, grasps, hand) | {
             "colours": list(INSTANCE_COLOURS[: len(numbers)]),
@@ -378,5 +379,8 @@ class Clutter(Scenes):
                 {"pose": columns_of(X), "mesh": f"/mesh/object-{number}.json"}
                 for X, number in zip(poses[1:], numbers[1:], strict=False)
             ],
-            "boxes": [{"size": b.size.tolist(), "pose": columns_of(b.X_TB)} for b in boxes],
+            "walls": [
+                {"vertices": each.vertices.ravel().tolist(), "faces": each.faces.ravel().tolist()}
+                for each in (convex_hull(wall.corners) for wall in walls)
+            ],
         }

@@ -28,6 +28,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 from pydrake.planning import RobotDiagramBuilder, SceneGraphCollisionChecker
+from scipy.spatial import ConvexHull
 
 from drakegrasp.config import HandSource
 from drakegrasp.errors import ConfigError, first_line
@@ -36,7 +37,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import even_points
 from drakegrasp.hand.parsing import Chain, add_model, find_joints, make_chains
 from drakegrasp.hand.shapes import hull_triangles, shape_corners
-from drakegrasp.objects.surroundings import Neighbourhood
+from drakegrasp.objects.surroundings import CORNERS, Hull, Neighbourhood
 from drakegrasp.reach.arm import TABLE_SIZE, Arm
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.seeding import Stream
@@ -141,13 +142,16 @@ def make_cell(
         arm: The arm.
         source: The hand, see `load_hand`.
         X_FB: Pose (4, 4) of the hand's palm link on the flange.
-        around: What is around the object; its boxes are walls of the cell.
+        around: What is around the object; its walls are those of the cell.
 
     Raises:
         ConfigError: If Drake cannot use the arm, or its base is in a wall.
     """
-    walls = tuple((_bits(b.size), _bits(b.X_TB)) for b in around.boxes) if around else ()
-    return _cell(arm, source, _bits(X_FB), walls)
+    walls = []
+    for wall in around.walls if around else ():
+        shape = wall.vertices if isinstance(wall, Hull) else wall.size
+        walls.append((_bits(shape), _bits(wall.X_TB)))
+    return _cell(arm, source, _bits(X_FB), tuple(walls))
 
 
 def _bits(array: Array) -> bytes:
@@ -173,9 +177,11 @@ def _cell(
     welded(flange, palm, RigidTransform(X_FB))
     X_TS = RigidTransform(make_pose(np.eye(3), [0.0, 0.0, -TABLE_SIZE[2] / 2.0]))
     _add_shape(plant, plant.world_body(), X_TS, Box(*TABLE_SIZE), "table")
-    boxes = [(np.frombuffer(size), np.frombuffer(X).reshape(4, 4)) for size, X in walls]
-    for number, (size, X_TB) in enumerate(boxes):
-        _add_shape(plant, plant.world_body(), RigidTransform(X_TB), Box(size), f"wall_{number}")
+    # The size of a box is one row, the vertices of a hull are more.
+    solids = [(np.frombuffer(s).reshape(-1, 3), np.frombuffer(X).reshape(4, 4)) for s, X in walls]
+    for number, (rows, X_TB) in enumerate(solids):
+        shape = Box(rows[0]) if len(rows) == 1 else Convex(rows.T, "hull")
+        _add_shape(plant, plant.world_body(), RigidTransform(X_TB), shape, f"wall_{number}")
     plant.Finalize()
 
     chain = _chain_of(joints, first, arm)
@@ -199,9 +205,10 @@ def _cell(
         points=_points(checker),
     )
     _leave_out_overlaps(cell)
-    for size, X_TB in boxes:
+    for rows, X_TB in solids:
         p_BQ = transform_points(invert_pose(X_TB) @ arm.X_TA, cell.points[first.index()])
-        if (np.abs(p_BQ) < size / 2.0).all(axis=1).any():
+        planes = ConvexHull(rows * CORNERS if len(rows) == 1 else rows).equations
+        if (p_BQ @ planes[:, :3].T < -planes[:, 3]).all(axis=1).any():
             raise ConfigError(f"base must be clear of the walls, got {first.name()!r} in one")
     return cell
 

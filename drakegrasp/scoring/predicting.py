@@ -30,7 +30,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import override_config
 from drakegrasp.mesh.cloud import hull_solid, read_cloud
-from drakegrasp.objects.surroundings import Box, Neighbourhood, surroundings_of
+from drakegrasp.objects.surroundings import Neighbourhood, Wall, surroundings_of
 from drakegrasp.reach.arm import Arm
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.progress import Report, silent
@@ -207,7 +207,7 @@ class _SceneView(NamedTuple):
     """A view of a scene: its object with resting pose and pose X_TO (4, 4), and the image.
 
     In scenes of several objects, `instances` (h, w) is the mask of all of them, and there are the
-    boxes of the surroundings.
+    walls of the surroundings.
     """
 
     name: str
@@ -215,7 +215,7 @@ class _SceneView(NamedTuple):
     X_TO: Array
     view: View
     instances: AnyArray | None = None
-    boxes: tuple[Box, ...] = ()
+    walls: tuple[Wall, ...] = ()
 
 
 def _views(
@@ -235,8 +235,8 @@ def _views(
         )
         if data.several:
             name = str(scenes["surroundings"][scene])
-            boxes = surroundings_of(name, trees[name], str(data.path)).boxes
-            found = found._replace(resting=UNTOLD, instances=seen["mask"], boxes=boxes)
+            walls = surroundings_of(name, trees[name], str(data.path)).walls
+            found = found._replace(resting=UNTOLD, instances=seen["mask"], walls=walls)
         yield found
 
 
@@ -252,7 +252,7 @@ def _predict_view(
     try:
         cloud, around = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC), None
         if seen.instances is not None and (simulate or arm is not None):
-            around = seen_neighbours(view, seen.instances, seen.boxes, config)
+            around = seen_neighbours(view, seen.instances, seen.walls, config)
         how: dict[str, Any] = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
         found, _ = predict(cloud, view, config, **how, around=around)
     except TooLittleSeenError:

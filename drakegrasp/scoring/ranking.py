@@ -33,7 +33,7 @@ from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.cloud import Solid, column_solid, hull_solid, read_cloud
 from drakegrasp.objects.model import object_of
-from drakegrasp.objects.surroundings import Box, Neighbourhood
+from drakegrasp.objects.surroundings import Neighbourhood, Wall
 from drakegrasp.reach.arm import Arm
 from drakegrasp.reach.reaching import Reach, reach_attempt
 from drakegrasp.runtime.environment import one_thread
@@ -393,14 +393,14 @@ def place_completed(
 
 
 def seen_neighbours(
-    view: View, instances: AnyArray, boxes: Sequence[Box], config: Config
+    view: View, instances: AnyArray, walls: Sequence[Wall], config: Config
 ) -> Neighbourhood:
     """Return what is around an object, as far as an image shows it, in {T}.
 
     Args:
         view: The image, whose mask shows the object.
         instances: (h, w), another value on each object, 0 beside all.
-        boxes: Walls that are known.
+        walls: Walls that are known.
         config: The configuration of the lifts, with the mass of a neighbour.
 
     Raises:
@@ -420,7 +420,7 @@ def seen_neighbours(
     return Neighbourhood(
         models=tuple(each.model for each in found),
         X_TN=np.array([each.X_TO for each in found]).reshape(-1, 4, 4),
-        boxes=tuple(boxes),
+        walls=tuple(walls),
     )
 
 

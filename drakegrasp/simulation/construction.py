@@ -76,7 +76,7 @@ from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid, hull_text, obj_text
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.objects.surroundings import Neighbourhood
+from drakegrasp.objects.surroundings import Hull, Neighbourhood
 from drakegrasp.simulation.attempt import Materials
 from drakegrasp.simulation.scene import Motor, Neighbour, ObjectScene, Scene, joint_limits
 from drakegrasp.vision.camera import object_colour
@@ -131,7 +131,7 @@ def build_scene(
         physics: Materials, solver and time step.
         hand: The hand.
         meshcat: Where to show the scene while it is simulated; the results have the same bits.
-        around: Neighbours and boxes around the object; None if it is alone on the table.
+        around: Neighbours and walls around the object; None if it is alone on the table.
     """
     physics, hand = model.own_physics(physics), within_load(hand, physics.finger_load)
     build = partial(_with_coarse, model, physics, hand, meshcat, around)
@@ -173,7 +173,7 @@ def build_object_scene(
         meshcat: Where to show the scene while it is simulated.
         resting_surface: Surface that meets the table, in {O}; None for the object's
             `resting_surface`.
-        around: Neighbours and boxes around the object; None if it is alone on the table.
+        around: Neighbours and walls around the object; None if it is alone on the table.
     """
     physics = model.own_physics(physics)
     # If nothing is around it, the object meets the table alone.
@@ -201,7 +201,7 @@ def _draft(
         physics: Materials, solver and time step.
         surfaces: The object's surfaces in {O}, by their contact partners `hand` and `table`.
         meshcat: Where to show the scene.
-        around: Neighbours and boxes around the object.
+        around: Neighbours and walls around the object.
     """
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(
@@ -306,7 +306,7 @@ def _add_around(
     around: Neighbourhood,
     physics: PhysicsConfig,
 ) -> dict[str, Any]:
-    """Add free neighbours and fixed boxes, and return the attributes of `ObjectScene` about them.
+    """Add free neighbours and fixed walls, and return the attributes of `ObjectScene` about them.
 
     A neighbour has the surfaces of the object. Drake finds no hydroelastic contact between two
     rigid meshes, so objects meet each other by a third shape: their convex hull, as compliant as
@@ -325,7 +325,7 @@ def _add_around(
         neighbours.append(Neighbour(body=body, model=other, X_WN=multiply(X_WT, X_TN)))
     if neighbours:
         _add_hull(plant, object_body, model, physics)
-    if not around.boxes:
+    if not around.walls:
         return {"neighbours": tuple(neighbours)}
 
     # The walls are of the table's material, on a body of their own, see the module.
@@ -334,8 +334,9 @@ def _add_around(
     properties = ProximityProperties()
     AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
     _add_material(properties, partner_friction(physics.friction_table, physics), physics)
-    for i, box in enumerate(around.boxes):
-        shape, X_TB = Box(*box.size), RigidTransform(box.X_TB)
+    for i, wall in enumerate(around.walls):
+        X_TB = RigidTransform(wall.X_TB)
+        shape = Convex(wall.vertices.T, "hull") if isinstance(wall, Hull) else Box(*wall.size)
         plant.RegisterCollisionGeometry(walls, X_TB, shape, f"wall_{i}", properties)
         plant.RegisterVisualGeometry(walls, X_TB, shape, f"wall_{i}", WALL_COLOUR)
     return {"neighbours": tuple(neighbours), "walls": walls}
@@ -355,19 +356,21 @@ def _add_hull(
     points = model.collision_vertices
     text = obj_text(points, model.collision_faces, normals=False)
     hull = Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "hull")), 1.0)
-    if not _is_accepted(hull, properties):
+    if not accepts_hull(hull):
         text = hull_text(points[np.unique((points @ HULL_DIRECTIONS.T).argmax(axis=0))])
         hull = Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "hull")), 1.0)
     plant.RegisterCollisionGeometry(body, RigidTransform(), hull, "hull", properties)
 
 
-def _is_accepted(shape: Convex, properties: ProximityProperties) -> bool:
+def accepts_hull(shape: Convex) -> bool:
     """Return whether Drake accepts a shape; a plant that refused one cannot be used any more."""
+    properties, modulus = ProximityProperties(), PhysicsConfig().table_modulus
+    AddCompliantHydroelasticProperties(RESOLUTION_HINT, modulus, properties)
     graph, instance = SceneGraph(), GeometryInstance(RigidTransform(), shape, "hull")
     instance.set_proximity_properties(properties)
     try:
         graph.RegisterAnchoredGeometry(graph.RegisterSource("trial"), instance)
-    except RuntimeError:
+    except (RuntimeError, SystemExit):  # SystemExit: failed assertion in Drake
         return False
     return True
 

@@ -68,7 +68,7 @@ def pile_up(
     X_TN = np.zeros((0, 4, 4))
     physics = config.physics.model_copy(update={"time_step": RANDOM_STEP})
     for i, (model, X_TO) in enumerate(zip(models, resting, strict=True)):
-        around = Neighbourhood(models=tuple(models[:i]), X_TN=X_TN, boxes=surroundings.boxes)
+        around = Neighbourhood(models=tuple(models[:i]), X_TN=X_TN, walls=surroundings.walls)
         try:
             scene = build_object_scene(model, physics, around=around)
             if i == 0 or not surroundings.drops:
@@ -109,7 +109,7 @@ def _lower(scene: ObjectScene, X_TN: Array, surroundings: Surroundings, stream: 
         transform_points(X, each.model.collision_vertices)[:, 2].max()
         for each, X in zip(scene.neighbours, X_TN, strict=True)
     ]
-    tops += [box.X_TB[2, 3] + 0.5 * box.size[2] for box in surroundings.boxes]
+    tops += [wall.corners[:, 2].max() for wall in surroundings.walls]
     X_TO = make_pose(R_TO, [0.0, 0.0, max(tops) + LOWERING - lowest])
     X_TO[:2, 3] = DROP_AREA * surroundings.extent * (2.0 * u - 1.0)
     reset_object(scene, multiply(X_WT, X_TO))

@@ -98,7 +98,7 @@ class ObjectScene:
         table_side: The object's surface for contact with the table; a hand uses the other surface.
         physics: The configuration with which the scene was built.
         neighbours: The free objects beside it.
-        walls: The body of the boxes around it; None if there are none.
+        walls: The body of the walls around it; None if there are none.
     """
 
     model: ObjectModel

@@ -46,9 +46,9 @@ from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.file_format import MODELS
 from drakegrasp.hand.parsing import make_parser
-from drakegrasp.mesh.surfaces import obj_text
+from drakegrasp.mesh.surfaces import convex_hull, obj_text
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.objects.surroundings import Neighbourhood
+from drakegrasp.objects.surroundings import Hull, Neighbourhood
 from drakegrasp.runtime.environment import prepare_rendering
 from drakegrasp.vision.camera import Appearance, Lens, object_colour, unproject, usual_appearance
 
@@ -141,8 +141,9 @@ def build_renderer(
     (instance,) = make_parser(plant).AddModels(MODELS / "table.urdf")
     table = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), table.body_frame(), RigidTransform(X_WT))
-    for i, box in enumerate(() if around is None else around.boxes):
-        X_WB, shape = RigidTransform(multiply(X_WT, box.X_TB)), Box(*box.size)
+    for i, wall in enumerate(() if around is None else around.walls):
+        X_WB = RigidTransform(multiply(X_WT, wall.X_TB))
+        shape = _drawn_hull(wall) if isinstance(wall, Hull) else Box(*wall.size)
         plant.RegisterVisualGeometry(plant.world_body(), X_WB, shape, f"wall_{i}", WALL_COLOUR)
     plant.Finalize()
     diagram = builder.Build()
@@ -229,6 +230,11 @@ def drawn_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, name: str) -> Mesh
     """Return vertices (n, 3) [m] and faces (m, 3) as a named shape with smooth shading."""
     text = obj_text(vertices, faces, normals=True)
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
+
+
+def _drawn_hull(hull: Hull) -> Mesh:
+    solid = convex_hull(hull.vertices)
+    return drawn_mesh(solid.vertices, solid.faces, "hull")
 
 
 def render(

@@ -159,7 +159,8 @@ each, gzip 1. Unlike in the data files, values are NaN where no lift was tried.
 `drakegrasp clutter` writes `clutter.hdf5` with the same groups, see [grasps among other
 objects](../how-to/clutter.md). There `o` is the largest number of objects of a scene, and `/grasps`
 has the samples of all of them. Its attribute `clutter` (JSON) says what was asked for: `objects`,
-`tries`, and the boxes of all `surroundings` by their names.
+`tries`, and the boxes and hulls of all `surroundings` by their names: a hull is that of `vertices`
+(n, 3) in {T} [m].
 
 ### /scenes
 """

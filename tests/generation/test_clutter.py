@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 from pathlib import Path
 
@@ -9,17 +11,20 @@ import h5py
 import numpy as np
 import pytest
 from helpers.commands import error_line, run
+from helpers.pages import open_pages
 
 import drakegrasp as dg
 from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.clutter import load_scene
 from drakegrasp.dataset.paths import CLUTTER_FOLDER, clutter_path
 from drakegrasp.dataset.schema import HITS_NOTHING, NOT_TRIED
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
-from drakegrasp.objects.surroundings import load_surroundings, surroundings_of
+from drakegrasp.objects.surroundings import surroundings_of
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import processes
+from drakegrasp.simulation.fixtures import load_surroundings
 
 pytestmark = pytest.mark.sim
 
@@ -172,3 +177,32 @@ def test_own_boxes_are_read_back_with_the_same_bits(tmp_path: Path) -> None:
         first = load_surroundings(path)
         again = surroundings_of("own", first.tree(), "own")
         np.testing.assert_array_equal(again.boxes[0].X_TB, first.boxes[0].X_TB)
+
+
+def test_scenes_in_a_model_need_its_file_no_more(small_dataset: Path, tmp_path: Path) -> None:
+    """They are loaded, tried again and shown from clutter.hdf5 alone."""
+    path, out = tmp_path / "post.sdf", Path(shutil.copytree(small_dataset, tmp_path / "out"))
+    post = "<cylinder><radius>0.01</radius><length>0.2</length></cylinder>"
+    path.write_text(
+        '<sdf version="1.9"><model name="post"><link name="post"><collision name="post">'
+        f"<pose>0 0 0.1 0 0 0</pose><geometry>{post}</geometry></collision></link></model></sdf>"
+    )
+    surroundings = load_surroundings(path)
+    (due,) = surroundings.hulls
+    request = ClutterRequest(scenes=1, objects=(2, 2), surroundings=[surroundings], tries=1)
+    make_clutter(out, request)
+    path.unlink()
+    line = error_line(run("clutter", out, "--surroundings", path))
+    assert "a YAML file or a model (.sdf, .urdf, .dmd.yaml), got" in line
+    around = load_scene(out / "clutter.hdf5", 0).surroundings
+    assert around.name == "post"
+    np.testing.assert_array_equal(around.hulls[0].corners, due.corners)
+    with h5py.File(out / "clutter.hdf5") as file:
+        tried = np.flatnonzero(file["grasps/outcome"][:] != NOT_TRIED)
+    assert dg.replay_clutter(out, int(tried[0])).same
+    page = open_pages(out).get("/clutter/0").text
+    (text,) = re.findall(r'<script type="application/json" id="scene">(.*?)</script>', page)
+    (wall,) = json.loads(text)["scene"]["walls"]
+    shown = np.reshape(wall["vertices"], (-1, 3))[wall["faces"]]
+    np.testing.assert_allclose(shown.min(axis=0), due.corners.min(axis=0), atol=1e-12)
+    np.testing.assert_allclose(shown.max(axis=0), due.corners.max(axis=0), atol=1e-12)

@@ -26,11 +26,11 @@ from drakegrasp.dataset.rejections import AttemptKey, read_decisions
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.generation.scenes import make_scenes
-from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.page.app import Inspection, listen, make_app
 from drakegrasp.page.snapshot import Snapshot, read_snapshot
 from drakegrasp.reach.arm import load_arm
 from drakegrasp.reach.rows import reach_dataset
+from drakegrasp.simulation.fixtures import load_surroundings
 
 playwright = pytest.importorskip("playwright.sync_api")
 Browser, Page = playwright.Browser, playwright.Page

@@ -18,9 +18,9 @@ from starlette.testclient import TestClient
 from drakegrasp.dataset.schema import HITS_NOTHING, HITS_TABLE, NO_OBJECT, NOT_TRIED
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.generation.scenes import make_scenes
-from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.outcomes import Outcome
 from drakegrasp.page.scenes import CLEAN, FAILS, FREE, HITS, HOLDS, KEPT, NOT_KEPT, UNKNOWN
+from drakegrasp.simulation.fixtures import load_surroundings
 
 pytestmark = pytest.mark.sim
 
@@ -286,7 +286,7 @@ def test_page_tells_what_happened_to_each_grasp(
     scene = scene_in(page)
     poses = [scene["object"], *(each["pose"] for each in scene["others"])]
     np.testing.assert_allclose([pose[12:15] for pose in poses], p_TO, atol=1e-6)
-    assert len(scene["boxes"]) == walls and len(scene["colours"]) == len(known)
+    assert len(scene["walls"]) == walls and len(scene["colours"]) == len(known)
     assert all(clutter_client.get(each["mesh"]).status_code == 200 for each in scene["others"])
     due = [look[2] for look in (CLEAN, KEPT, NOT_KEPT, FREE)] + [HITS[2]] * (own.sum() - 4)
     assert [palm["colour"] for palm in scene["palms"]] == due

@@ -25,11 +25,11 @@ from drakegrasp.frames import Array, invert_pose, make_pose, rotation_about
 from drakegrasp.generation.attempts import find_attempt
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.grasp import pack_grasp, transform_grasp
-from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.reach import rows
 from drakegrasp.reach.reaching import Reach, reach_attempt
 from drakegrasp.reach.rows import reach_dataset
 from drakegrasp.runtime.files import seal
+from drakegrasp.simulation.fixtures import load_surroundings
 from drakegrasp.table import Table
 
 pytestmark = pytest.mark.sim
@@ -141,7 +141,7 @@ def test_predictions_in_scenes_are_asked_among_what_is_seen(
     assert not np.any(table.confidence)
     around = [call.kwargs["around"] for call in spy.call_args_list]
     assert {len(each.models) for each in around} == {1}
-    assert {len(each.boxes) for each in around} == {0}, "the scenes of the split have no walls"
+    assert {len(each.walls) for each in around} == {0}, "the scenes of the split have no walls"
 
 
 # The file

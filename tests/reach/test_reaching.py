@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from drakegrasp.frames import Array, invert_pose, make_pose, rotation_about, rot
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.objects.surroundings import Box, Neighbourhood
+from drakegrasp.objects.surroundings import CORNERS, Box, Hull, Neighbourhood, Wall
 from drakegrasp.reach.arm import load_arm, mount_of, mount_pose
 from drakegrasp.reach.branches import find_branches, flange_poses, follow
 from drakegrasp.reach.cell import Cell, make_cell
@@ -230,12 +231,12 @@ def wall(x: float, height: float) -> Box:
     return Box(size=size, X_TB=make_pose(np.eye(3), [x, 0.0, height / 2.0]))
 
 
-def around_of(*boxes: Box, neighbours: dict[ObjectModel, Array] | None = None) -> Neighbourhood:
-    """Return boxes, and neighbours by their positions."""
+def around_of(*walls: Wall, neighbours: dict[ObjectModel, Array] | None = None) -> Neighbourhood:
+    """Return walls, and neighbours by their positions."""
     found = neighbours or {}
     X_TN = [make_pose(np.eye(3), p_TN) for p_TN in found.values()]
     return Neighbourhood(
-        models=tuple(found), X_TN=np.array(X_TN).reshape(-1, 4, 4), boxes=tuple(boxes)
+        models=tuple(found), X_TN=np.array(X_TN).reshape(-1, 4, 4), walls=tuple(walls)
     )
 
 
@@ -252,22 +253,29 @@ def reach_among(
     return reach_grasp(cell, box.field, top_grasp(cell, around=around, **changes))
 
 
-def test_a_wall_in_the_way_of_the_arm(six: Path, box: ObjectModel) -> None:
-    free, beside = reach_among(six, box, None), reach_among(six, box, around_of(wall(0.6, 0.3)))
+def hull(box: Box) -> Hull:
+    return Hull(vertices=box.size * CORNERS, X_TB=box.X_TB)
+
+
+@pytest.mark.parametrize("of", [lambda box: box, hull], ids=["box", "hull"])
+def test_a_wall_in_the_way_of_the_arm(
+    six: Path, box: ObjectModel, of: Callable[[Box], Wall]
+) -> None:
+    free, beside = reach_among(six, box, None), reach_among(six, box, around_of(of(wall(0.6, 0.3))))
     assert free.reachable
     np.testing.assert_array_equal(beside.q, free.q)
     assert beside.clearance == free.clearance
 
     # Nothing gets past a high wall, unless the arm stands on the other side of it.
-    high = around_of(wall(-0.25, 1.2))
+    high = around_of(of(wall(-0.25, 1.2)))
     assert reach_among(six, box, high).outcome == "collision"
     assert reach_among(six, box, high, (0.5, 0.0, 0.0, 0.3)).reachable
     # A low wall is passed, and the arm comes nearer to it than to the table.
-    low = reach_among(six, box, around_of(wall(-0.15, 0.1)))
+    low = reach_among(six, box, around_of(of(wall(-0.15, 0.1))))
     assert low.reachable
     assert low.clearance < free.clearance
     with pytest.raises(ConfigError, match="base must be clear of the walls, got 'base' in one"):
-        reach_among(six, box, around_of(wall(-0.45, 0.05)))
+        reach_among(six, box, around_of(of(wall(-0.45, 0.05))))
 
 
 def test_a_neighbour_in_the_way_of_arm_or_hand(six: Path, box: ObjectModel, tmp_path: Path) -> None:

@@ -14,11 +14,11 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.clutter import load_scene
 from drakegrasp.dataset.scenes import SceneDataset, SceneRows
 from drakegrasp.frames import unpack_pose
-from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.scoring import ranking
 from drakegrasp.scoring.predicting import _predict_view, _SceneView, predict, predict_scenes
 from drakegrasp.scoring.ranking import seen_neighbours
 from drakegrasp.simulation.attempt import Attempt
+from drakegrasp.simulation.fixtures import load_surroundings
 from drakegrasp.verification.placing import dataset_config, place_on_rows
 from drakegrasp.vision.depth_image import View
 
@@ -168,10 +168,10 @@ def test_grasps_are_for_the_objects_of_the_rows(rows: SceneRows) -> None:
 def test_the_others_are_completed_from_the_view(
     rows: SceneRows, first: tuple[View, np.ndarray]
 ) -> None:
-    boxes = load_surroundings("bin").boxes
-    around = seen_neighbours(*first, boxes, dataset_config(rows))
+    walls = load_surroundings("bin").walls
+    around = seen_neighbours(*first, walls, dataset_config(rows))
     (model,), (X_TN,) = around.models, around.X_TN
-    assert around.boxes == boxes
+    assert around.walls == walls
     due = load_scene(rows.path, int(rows.scenes[0])).X_TO[1 - int(rows.places[0])]
     assert np.linalg.norm(X_TN[:3, 3] - due[:3, 3]) < 0.03
     assert 0.04 < 2.0 * model.half_extents.max() < 0.2

@@ -12,10 +12,11 @@ from drakegrasp.config import Config
 from drakegrasp.frames import make_pose, rotation_about, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.objects.surroundings import Box, Neighbourhood, load_surroundings
+from drakegrasp.objects.surroundings import Box, Neighbourhood
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.fixtures import load_surroundings
 from drakegrasp.simulation.free import first_hit
 from drakegrasp.simulation.pile import PileError, pile_up
 from drakegrasp.simulation.placement import aligned_pose, canonical_pose
@@ -161,7 +162,7 @@ def test_what_the_hand_meets_first_is_told(
     palm = float(X_TO[2, 3] + attempt.X_OG[2, 3])
     assert met(beside(brick, 0.0, 0.0, below=palm + 0.12)) == "neighbour_0"
     wall = Box(size=np.array([0.5, 0.02, 0.3]), X_TB=make_pose(UP, [0.0, 0.05, 0.15]))
-    assert met(Neighbourhood(X_TN=np.zeros((0, 4, 4)), boxes=(wall,))) == "table"
+    assert met(Neighbourhood(X_TN=np.zeros((0, 4, 4)), walls=(wall,))) == "table"
 
 
 def test_a_neighbour_with_points_that_are_almost_equal_can_be_there(
@@ -181,9 +182,9 @@ def test_a_neighbour_with_points_that_are_almost_equal_can_be_there(
 def test_neighbours_and_walls_move_together(brick: ObjectModel) -> None:
     wall = Box(size=np.array([0.5, 0.02, 0.3]), X_TB=make_pose(UP, [0.0, 0.2, 0.15]))
     around = Neighbourhood(
-        models=(brick,), X_TN=make_pose(UP, [0.1, 0.0, 0.02])[None], boxes=(wall,)
+        models=(brick,), X_TN=make_pose(UP, [0.1, 0.0, 0.02])[None], walls=(wall,)
     )
     moved = around.moved(make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2.0), [0.3, 0.0, 0.0]))
     np.testing.assert_allclose(moved.X_TN[0, :3, 3], [0.3, 0.1, 0.02], atol=1e-12)
-    np.testing.assert_allclose(moved.boxes[0].X_TB[:3, 3], [0.1, 0.0, 0.15], atol=1e-12)
-    np.testing.assert_allclose(moved.boxes[0].X_TB[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(moved.walls[0].X_TB[:3, 3], [0.1, 0.0, 0.15], atol=1e-12)
+    np.testing.assert_allclose(moved.walls[0].X_TB[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)

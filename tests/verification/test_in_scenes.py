@@ -18,8 +18,8 @@ from drakegrasp.errors import DataError, DrakegraspError, GraspError
 from drakegrasp.frames import invert_pose, make_pose, rotation_about
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.grasp import pack_grasp, transform_grasp
-from drakegrasp.objects.surroundings import load_surroundings
 from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.fixtures import load_surroundings
 from drakegrasp.simulation.placement import place_object
 
 pytestmark = pytest.mark.sim

@@ -53,18 +53,19 @@
     group.matrix.fromArray(columns);
   };
   place(object, data.object);
-  // Around the object in a scene of several: its neighbours, and boxes that never move.
+  // Around the object in a scene of several: its neighbours, and walls that never move.
   const others = (data.others || []).map(({ pose }) => {
     const other = new THREE.Group();
     place(other, pose);
     around.add(other);
     return other;
   });
-  for (const { size, pose } of data.boxes || []) {
-    const look = { color: "#8d949d", roughness: 1, transparent: true, opacity: 0.35, depthWrite: false };
-    const box = new THREE.Mesh(new THREE.BoxGeometry(...size), new THREE.MeshStandardMaterial(look));
-    place(box, pose);
-    around.add(box);
+  const look = { color: "#8d949d", roughness: 1, transparent: true, opacity: 0.35, depthWrite: false, flatShading: true };
+  for (const { vertices, faces } of data.walls || []) {
+    const surface = new THREE.BufferGeometry();
+    surface.setAttribute("position", new THREE.Float32BufferAttribute(vertices, 3));
+    surface.setIndex(faces);
+    around.add(new THREE.Mesh(surface, new THREE.MeshStandardMaterial(look)));
   }
   const links = meshes.links.map(() => new THREE.Group());
   links.forEach((link) => hand.add(link));
