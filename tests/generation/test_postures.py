@@ -102,6 +102,7 @@ def test_each_row_is_an_attempt_with_its_outcome(dataset):
         (Outcome.START_COLLISION, 2, 0, 2.0, False, Source.POSTURES),
         (Outcome.BELOW_TABLE, 3, 0, 3.0, False, Source.POSTURES),
     ]
+    assert not trials["preshape"].any()  # the hand has none
     assert check_dataset(dataset) == []
 
 

@@ -18,6 +18,7 @@ from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.filters import Removal
 from drakegrasp.frames import make_pose
 from drakegrasp.grasp import unused_fingers
+from drakegrasp.hand.checks import check_couplings
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.kinematics import (
     closed_positions,
@@ -187,6 +188,13 @@ def test_a_finger_that_turns_is_not_driven_by_one_that_slides(tmp_path: Path) ->
     )
     with pytest.raises(HandError, match=message):
         shared(tmp_path, urdf=turning)
+
+
+def test_hand_check_asks_for_the_motor_that_the_model_shares(tmp_path: Path) -> None:
+    """Its fingers mimic each other in the URDF."""
+    finding = check_couplings(load_hand(write_slider(tmp_path)))
+    assert "'right_slide' must be coupled to 'left_slide' by 1 and 0" in finding.text
+    assert check_couplings(shared(tmp_path)).ok
 
 
 def test_fingers_of_one_motor_close_in_step(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 import drakegrasp.mesh.components
 import drakegrasp.mesh.repair
 from drakegrasp.errors import MeshError
+from drakegrasp.mesh.components import part_touching_edges
+from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     is_solid_surface,
     signed_volume,
@@ -139,6 +141,20 @@ def test_whole_windings_are_those_of_the_solid_angles():
     expected = winding_numbers(points, vertices, faces)
     assert set(np.rint(expected)) == {-1.0, 0.0, 1.0, 2.0, 3.0}
     np.testing.assert_allclose(whole_windings(points, vertices, faces), expected, atol=1e-9)
+
+
+def test_touching_edge_gets_a_vertex_for_each_side():
+    """Two bricks share an edge; each keeps its own two faces at both halves of it."""
+    corner, other = box((0.02,) * 3), box((0.02,) * 3, (0.02, 0.02, 0.0))
+    vertices, faces = weld(
+        np.vstack((corner.vertices, other.vertices)), np.vstack((corner.faces, other.faces + 8))
+    )
+    assert not is_solid_surface(faces)
+    parted, new_faces = part_touching_edges(vertices, faces)
+    assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
+    np.testing.assert_allclose(parted[-2:], [[0.01, 0.01, 0.0]] * 2, atol=1e-12)
+    assert is_solid_surface(new_faces)
+    assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
 
 
 @settings(max_examples=10, deadline=None)

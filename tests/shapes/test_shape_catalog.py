@@ -116,6 +116,7 @@ def test_as_many_of_each_class_as_asked_for() -> None:
     assert set(counts.values()) == {3} and len(counts) == 64
     assert [item.name for item in drawn[:4]] == ["1_mug_1", "1_mug_2", "1_mug_3", "2_bottle_1"]
     assert {item.seed for item in drawn} == {5}
+    assert drawn[0].sizes != drawn[1].sizes
 
 
 def test_seam_that_rounding_opens_is_closed() -> None:
