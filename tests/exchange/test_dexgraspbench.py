@@ -161,20 +161,15 @@ def test_each_scene_has_object_and_links_where_they_were(
             np.testing.assert_allclose(found.xpos, posed.link_pose(link)[:3, 3], atol=1e-6)
 
 
-@pytest.fixture
-def model(exported: Callable[[str], Path], grasps: list[ClosedGrasp]) -> Any:
+def test_motors_keep_the_fingers_and_the_object_touches_with_its_convex_parts(
+    exported: Callable[[str], Path], grasps: list[ClosedGrasp]
+) -> None:
     path = exported("mjcf") / grasps[0].object_name / f"{grasps[0].trial_id}.xml"
-    return mujoco.MjModel.from_xml_path(str(path))
-
-
-def test_motors_keep_the_fingers_where_they_are(model: Any) -> None:
-    joints = model.actuator_trnid[:, 0]
-    at = model.key_qpos[0][model.jnt_qposadr[joints]]
+    model = mujoco.MjModel.from_xml_path(str(path))
+    at = model.key_qpos[0][model.jnt_qposadr[model.actuator_trnid[:, 0]]]
     np.testing.assert_allclose(model.key_ctrl[0], at)
     assert model.body("object").mass[0] == pytest.approx(1.0)
 
-
-def test_object_touches_with_its_convex_parts(model: Any, grasps: list[ClosedGrasp]) -> None:
     # A box is one part, with its own edges.
     (part,) = np.flatnonzero(model.geom_bodyid == model.body("object").id)
     np.testing.assert_allclose(model.geom_aabb[part], [0.0, 0.0, 0.0, 0.025, 0.03, 0.05], atol=1e-7)
