@@ -17,6 +17,7 @@ from helpers.hands import write_with_optional_fingers
 import drakegrasp as dg
 from drakegrasp.cli.verify import Target, place
 from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes import SceneRows
 from drakegrasp.errors import DataError, GraspError, HandError
@@ -82,11 +83,13 @@ def test_postures_of_rows_are_tried_with_the_friction_and_mass_of_their_rows(
     assert sorted(grasp.index for grasp in grasps) == list(range(len(data)))
     for grasp in grasps:
         row = data[int(rows[grasp.index])]
-        assert grasp.placed.model.name == row.props["object_name"]
-        assert grasp.placed.model.mass == pytest.approx(float(row.props["work2mass"][0]))
-        assert grasp.config.physics.friction_hand == pytest.approx(
-            float(row.conditions["friction_hand"])
-        )
+        model, physics = grasp.placed.model, grasp.config.physics
+        assert model.name == row.props["object_name"]
+        assert model.mass == pytest.approx(float(row.props["work2mass"][0]))
+        usual = load_prepared(drawn, model.name, read_manifest(drawn).config).model
+        np.testing.assert_allclose(model.I_OOcm_O / model.mass, usual.I_OOcm_O / usual.mass)
+        for name in ("friction_hand", "friction_table"):
+            assert getattr(physics, name) == pytest.approx(float(row.conditions[name]))
     assert told is not None
     assert told.row.tolist() == rows.tolist()
 

@@ -24,10 +24,7 @@ from helpers.objects import write_above
 from helpers.physics import broken_physics
 from helpers.tiers import few
 
-from drakegrasp.api.verifying import verify_grasps
 from drakegrasp.dataset.check import check_dataset
-from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import FIELDS, GraspDataset
 from drakegrasp.dataset.schema import CONDITION_FIELDS, SPLITS
 from drakegrasp.dataset.trials import Trials
@@ -94,22 +91,6 @@ def test_replay_gives_the_same_bits(randomized: Path, tmp_path: Path, outcome: O
     replay = replay_trial(randomized, row)
     assert replay.same, replay.differences
     assert record_trial(randomized, row, tmp_path / "trial.html") is outcome
-
-
-def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) -> None:
-    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
-    rows = [len(data) - 1, 0]
-    grasps = np.array([data[row].grasp for row in rows])
-    usual = load_prepared(randomized, NAME, read_manifest(randomized).config).model
-    for row, verdict in zip(rows, verify_grasps(grasps, data, rows=rows), strict=True):
-        props, conditions = data[row].props, data[row].conditions
-        model = verdict.placed.model
-        assert model.mass == pytest.approx(float(props["work2mass"][0]))
-        inertia = model.mass / usual.mass * usual.I_OOcm_O
-        np.testing.assert_allclose(model.I_OOcm_O, inertia, rtol=1e-9)
-        physics = verdict.config.physics
-        assert physics.friction_hand == pytest.approx(float(conditions["friction_hand"]))
-        assert physics.friction_table == pytest.approx(float(conditions["friction_table"]))
 
 
 # Two samplers take turns at several resting poses

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from helpers.meshes import G3DB, assert_sound, box, needs_g3db, write
+from helpers.meshes import box, write
 from helpers.tables import table
 
 from drakegrasp.errors import MeshError
@@ -130,14 +130,3 @@ def test_one_mesh_is_found_whatever_lies_beside_it(tmp_path):
             find_mesh(tmp_path / name)
     with pytest.raises(MeshError, match="units must be one of m, cm, mm, got 'inch'"):
         find_mesh(tmp_path / "b.obj", units="inch")
-
-
-@needs_g3db
-def test_boots_are_in_metres(tmp_path):
-    (source,) = (s for s in find_meshes(G3DB, units="cm") if "boots" in s.name)
-    with pytest.raises(MeshError, match=r"95_boots_final\.obj: .*--units .*objects\.yaml"):
-        prepare_object(source)
-    manifest = tmp_path / "objects.yaml"
-    manifest.write_text("units: cm\nobjects: {95_boots_final: {units: m}}\n")
-    (source,) = (s for s in find_meshes(G3DB, manifest=manifest) if "boots" in s.name)
-    assert_sound(prepare_object(source))

@@ -206,14 +206,6 @@ def test_one_point_in_the_air_is_told(cube, grasp):
     assert not any(word in text for word in ("Before closing", "In a dataset"))
 
 
-def test_invalid_row_is_a_verdict_without_a_trial(cube):
-    found = verify(cube, np.full((3, 3), np.nan), np.eye(3))
-    assert found.outcome is Outcome.INVALID and not found.outcome.inconclusive
-    assert not (found.matches or found.lifted or found.lifted_any or found.kept)
-    assert found.tries == () and found.fit is None and np.isnan(found.surface_distance).all()
-    assert found.explain() == "The grasp of 1_cube_a fails (invalid): number 1 is nan, not finite."
-
-
 def test_at_little_friction_it_does_not_hold(cube, grasp):
     found = verify(cube, *grasp, override_config(CONFIG, ["physics.friction_hand=0.05"]))
     assert found.outcome in (Outcome.DROPPED, Outcome.SLIPPED, Outcome.PARTLY_HELD)
