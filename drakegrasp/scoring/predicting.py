@@ -182,6 +182,7 @@ def predict_scenes(
     data = SceneDataset(path, points=None, split=split, negatives="none", balance="view", grasps=1)
     if not len(data):
         raise GraspError(f"{path}: {data.emptiness}")
+
     rows = SceneRows(path, split=split) if data.several else None
     views = list(data.views.tolist() if rows is None else rows.views.tolist())
     places = [0] * len(views) if rows is None else rows.places.tolist()
