@@ -692,7 +692,8 @@ def set_materials(scene: Scene, materials: Materials) -> None:
         inertia = object_inertia(scene.model, materials.mass)
         scene.object.SetSpatialInertiaInBodyFrame(scene.context, inertia)
     _set_friction(scene, scene.object, object_friction(materials))
-    _set_friction(scene, scene.table, partner_friction(materials.friction_table, materials))
+    for fixed in filter(None, (scene.table, scene.walls)):
+        _set_friction(scene, fixed, partner_friction(materials.friction_table, materials))
     for link in scene.links:
         _set_friction(scene, link, partner_friction(materials.friction_hand, materials))
 

@@ -10,8 +10,10 @@ import pytest
 from helpers.objects import STANDOFF, from_above, standing
 
 from drakegrasp.config import CameraConfig, Config
+from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.objects.surroundings import Box, Neighbourhood
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.attempt import Attempt, Materials, usual_conditions
 from drakegrasp.simulation.construction import FRICTION, build_scene
@@ -35,7 +37,7 @@ def frictions(scene: Scene) -> list[float]:
     inspector = scene.plant.EvalSceneGraphInspector(scene.context)
     return [
         inspector.GetProximityProperties(geometry).GetProperty(*FRICTION).dynamic_friction()
-        for body in (scene.object, scene.table, *scene.links)
+        for body in filter(None, (scene.object, scene.table, scene.walls, *scene.links))
         for geometry in scene.plant.GetCollisionGeometriesForBody(body)
     ]
 
@@ -52,16 +54,21 @@ def assert_same_bits(one: TrialRecord, other: TrialRecord) -> None:
     ],
 )
 def test_materials_of_an_attempt_are_those_of_a_scene_built_with_them(
-    scene: Scene, cube: ObjectModel, config: Config, hand: Hand, materials: Materials
+    cube: ObjectModel, config: Config, hand: Hand, materials: Materials
 ) -> None:
+    X_TB = make_pose(np.eye(3), [0.0, 0.4, 0.15])
+    wall = Neighbourhood(
+        X_TN=np.zeros((0, 4, 4)), walls=(Box(size=np.array([0.5, 0.02, 0.3]), X_TB=X_TB),)
+    )
+    scene = build_scene(cube, config.physics, hand, around=wall)
     changes = {k: v for k, v in vars(materials).items() if k != "mass"}
     physics = config.physics.model_copy(update=changes)
     factor = materials.mass / cube.mass
     heavy = replace(cube, mass=materials.mass, I_OOcm_O=factor * cube.I_OOcm_O)
     plain = from_above(cube, STANDOFF)
-    alone = build_scene(heavy, physics, hand)
-    coefficients = frictions(alone)
-    built = run_attempt(alone, standing(cube), plain, config)
+    other = build_scene(heavy, physics, hand, around=wall)
+    coefficients = frictions(other)
+    built = run_attempt(other, standing(cube), plain, config)
     assert built.outcome is Outcome.SUCCESS
 
     found = run_attempt(
@@ -70,7 +77,7 @@ def test_materials_of_an_attempt_are_those_of_a_scene_built_with_them(
     assert_same_bits(found, built)
     assert frictions(scene) == coefficients
     # Nothing of them remains.
-    fresh = build_scene(cube, config.physics, hand)
+    fresh = build_scene(cube, config.physics, hand, around=wall)
     first, again = (run_attempt(s, standing(cube), plain, config) for s in (fresh, scene))
     assert_same_bits(again, first)
 
