@@ -44,8 +44,9 @@ R = TypeVar("R")
 
 #: Number of last tasks whose files a worker keeps.
 KEPT_TASKS = 8
-#: Time that the scheduler may take to send a file [s].
-FETCH_SECONDS = 300
+#: Time for which the scheduler looks for a file [s]. It has the files of a task before the task, so
+#: one that it does not have was forgotten with its task, and a worker that waits is blocked.
+FETCH_SECONDS = 1
 #: Number of deaths in one task after which the machine must be the cause.
 MOST_DEATHS = 400
 #: Dask's setting for the fraction of its memory that a worker, with the process beside it, may use.
@@ -307,7 +308,11 @@ def leave(build: str) -> None:
 
 def _fetched(name: str, worker: Worker) -> bytes:
     """Return a file by its name at the scheduler."""
-    found = sync(worker.loop, worker.scheduler.variable_get, name=name, timeout=FETCH_SECONDS)
+    get = worker.scheduler.variable_get
+    try:
+        found = sync(worker.loop, get, name=name, timeout=FETCH_SECONDS)
+    except TimeoutError:
+        raise MachineError(f"a file must be at the scheduler, got none ({name})") from None
     content: bytes = found["value"]
     if hashlib.sha256(content).hexdigest() != _digest_in(name):
         raise MachineError(f"a file must come from the scheduler unchanged, got another ({name})")

@@ -170,6 +170,13 @@ def test_error_of_a_task_is_raised_here_and_nothing_is_kept(client: Client, out:
         assert list(execute(abs, [-1])) == [1]
 
 
+def test_worker_does_not_wait_for_files_of_a_task_that_was_forgotten(client: Client) -> None:
+    files = {"in/0": f"drakegrasp-gone-build-0-{64 * '0'}"}
+    parcel = wire.Parcel(number=0, build="gone", call=b"", files=files, writes=())
+    with pytest.raises(MachineError, match="must be at the scheduler, got none"):
+        client.submit(wire.do_parcel, parcel).result(timeout=30)
+
+
 class Slow:
     """Takes a minute to be unpickled."""
 
