@@ -88,6 +88,9 @@ def test_a_value_that_may_be_but_was_not_written_is_refused(
     path.write_text(json.dumps(tree), encoding="utf-8")
     with pytest.raises(DataError, match="sha256: must be given"):
         read_manifest(tmp_path)
+    path.write_text('{"once": 1, "again": 2, "again": 3}', encoding="utf-8")
+    with pytest.raises(DataError, match="the key 'again' twice"):
+        read_manifest(tmp_path)
 
 
 def test_rule_of_the_split_splits_and_groups_are_stated(tmp_path: Path, manifest: Manifest) -> None:

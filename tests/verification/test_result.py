@@ -16,7 +16,7 @@ from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
 from drakegrasp.frames import make_pose, pack_pose
-from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import validate_writable
@@ -96,6 +96,9 @@ def test_explanation_says_whether_it_is_a_sample_and_what_is_not_judged(removal,
     text = verdict.explain()
     assert verdict.kept is (removal is Removal.KEPT)
     assert f"In a dataset {said} not judged: not_seen, flat_depth, outlier." in text
+    config = override_config(verdict.config, ["filters.outlier_sigma=0"])
+    text = replace(verdict, grasp=replace(verdict.grasp, config=config)).explain()
+    assert "not judged: not_seen, flat_depth." in text
 
 
 def test_hints_and_normalised_normals_are_told():
