@@ -217,7 +217,7 @@ def test_the_object_moves_with_the_hand(six: Path, tmp_path: Path) -> None:
     for height, outcome in ((0.3, "reachable"), (0.45, "lift")):
         grasp = top_grasp(
             cell,
-            X_TO=make_pose(np.eye(3), [-0.06, 0.0, 0.015]),
+            X_TO=make_pose(np.diag([1.0, -1.0, -1.0]), [-0.06, 0.0, 0.015]),
             X_TG=make_pose(np.diag([1.0, -1.0, -1.0]), [0.19, 0.0, 0.13]),
             q_closed=hand_at(cell, 0.0),
             p_TG_lifted=np.array([0.19, 0.0, height]),

@@ -85,6 +85,9 @@ def test_first_object_stands_in_a_resting_pose_and_another_one_may_lie_on_it(
     (alone,) = pile_up([cube], [standing(cube)], around, config, Stream(0, 1))
     np.testing.assert_allclose(canonical_pose(alone), canonical_pose(standing(cube)), atol=2e-6)
     np.testing.assert_array_equal(aligned_pose(alone, standing(cube)[None]), standing(cube))
+    on_side = make_pose(rotation_about([1.0, 0.0, 0.0], 0.5 * np.pi), [0.0, 0.0, 0.025])
+    (lying,) = pile_up([brick], [on_side], around, config, Stream(0, 1))
+    np.testing.assert_allclose(canonical_pose(lying), canonical_pose(on_side), atol=2e-6)
     tilted = make_pose(rotation_about([1.0, 0.0, 0.0], 0.3), alone[:3, 3])
     np.testing.assert_array_equal(
         aligned_pose(tilted, standing(cube)[None]), canonical_pose(tilted)
