@@ -291,7 +291,8 @@ def do_parcel(parcel: Parcel) -> Delivery:
     """Run a task on a worker; call this in the thread of the worker.
 
     Raises:
-        MachineError: If the process beside the worker dies repeatedly.
+        MachineError: If the process beside the worker dies repeatedly, or the scheduler has
+            forgotten a file.
         Exception: The error that the function raised.
     """
     global _copies

@@ -215,6 +215,8 @@ def count_clutter(out: Path) -> list[ClutterCount]:
     if not os.path.lexists(path):
         return []
     validate_state(path, Trials(out))
+
+    # The labels of each grasp, and what is around it.
     tables = SceneDataset(path, points=None).tables
     around, grasps = tables["scenes"]["surroundings"], tables["grasps"]
     where, outcome = around[grasps["scene"]], grasps["outcome"]
@@ -222,6 +224,7 @@ def count_clutter(out: Path) -> list[ClutterCount]:
     labels["tried"] = outcome != NOT_TRIED
     labels["neighbour_hit"] = outcome == Outcome.NEIGHBOUR_HIT
     reached = reached_in_scenes(out, labels["free"])
+
     return [
         ClutterCount(
             surroundings=name,

@@ -178,6 +178,8 @@ def _corners(shape: Shape, hull: Array | None, where: str) -> Array:
         return shape.size() * CORNERS
     if isinstance(shape, Sphere | Capsule | Cylinder | Ellipsoid):
         return _round_corners(shape)
+
+    # A hull in place of a mesh must not close its hollows.
     if hull is None:
         got = type(shape).__name__
         raise ConfigError(f"{where} must be a box, a round solid or a convex mesh, got {got}")
