@@ -16,8 +16,7 @@ if TYPE_CHECKING:
         make_benchmark,
         make_clutter_benchmark,
     )
-    from drakegrasp.api.predicting import predict_scenes
-    from drakegrasp.api.scoring import score
+    from drakegrasp.api.scoring import predict_scenes, score
     from drakegrasp.api.verifying import (
         verify_grasp,
         verify_grasps,
@@ -104,7 +103,7 @@ _HOMES = {
     "make_posture": "simulation.attempts",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",
-    "predict_scenes": "api.predicting",
+    "predict_scenes": "api.scoring",
     "propose": "scoring.predicting",
     "rank": "scoring.ranking",
     "reach_dataset": "reach.rows",

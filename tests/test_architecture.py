@@ -45,10 +45,7 @@ WALLS = {
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {
-    *(
-        (f"api.{module}", "distributed")
-        for module in ("building", "predicting", "scoring", "verifying")
-    )
+    *((f"api.{module}", "distributed") for module in ("building", "scoring", "verifying"))
 }
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (

@@ -34,9 +34,9 @@ COMMANDS = {
     "inspect": ("datasets:inspect", "Look at grasps in a browser, and reject them."),
     "figures": ("datasets:figures", "Draw a dataset: pictures as PNG and SVG, numbers as JSON."),
     "replay": ("datasets:replay", "Run a trial again and compare every value."),
-    "predict": ("predict:predict", "Write grasps for what a camera saw, best first."),
+    "predict": ("predictions:predict", "Write grasps for what a camera saw, best first."),
     "verify": ("verify:verify", "Try predicted grasps in the simulator."),
-    "score": ("score:score", "Score predicted grasps against reference rows."),
+    "score": ("predictions:score", "Score predicted grasps against reference rows."),
     "bench-set": ("build:bench_set", "Build the frozen benchmark drakegrasp-bench-1 in OUT."),
     "export": ("datasets:export", "Write the samples of a dataset in another format."),
 }

@@ -16,8 +16,8 @@ from drakegrasp.frames import X_WT, Array, invert_pose, rotate_vectors, transfor
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.table import Table
-from drakegrasp.verification.margin import surface_feet
 from drakegrasp.verification.placing import PlacedGrasp
+from drakegrasp.verification.prediction import surface_feet
 from drakegrasp.verification.wrist_solver import fit_wrist, make_postures, posture_misfit
 
 #: A face may be farther than the closest one by this and still be next to the point [m]. A

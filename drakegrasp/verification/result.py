@@ -38,8 +38,8 @@ from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.verification.hints import FAR, find_hints
-from drakegrasp.verification.margin import contact_epsilon
 from drakegrasp.verification.placing import PlacedGrasp
+from drakegrasp.verification.prediction import contact_epsilon
 from drakegrasp.verification.wrist_solver import WristFit
 
 #: Group of the HDF5 file that holds the fields.

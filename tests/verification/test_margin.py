@@ -11,7 +11,7 @@ from helpers.objects import CUBE, box_model
 
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.verification.hints import WALL, fit_surface
-from drakegrasp.verification.margin import (
+from drakegrasp.verification.prediction import (
     FRICTION_EDGES,
     MAX_ANGLE,
     MAX_DISTANCE,
