@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from drakegrasp.reach.arm import Arm, load_arm
     from drakegrasp.reach.rows import reach_dataset
     from drakegrasp.scoring.predicting import propose
-    from drakegrasp.scoring.ranking import Ranking, rank
+    from drakegrasp.scoring.ranking import Ranking, rank, seen_neighbours
     from drakegrasp.scoring.run import Score
     from drakegrasp.simulation.attempts import make_posture
     from drakegrasp.simulation.placement import PlacedObject, place_object, run_trial
@@ -111,6 +111,7 @@ _HOMES = {
     "replay_trial": "generation.replay",
     "run_trial": "simulation.placement",
     "score": "api.scoring",
+    "seen_neighbours": "scoring.ranking",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
     "verify_grasp": "api.verifying",
@@ -169,6 +170,7 @@ __all__ = [
     "replay_trial",
     "run_trial",
     "score",
+    "seen_neighbours",
     "transform_grasp",
     "unpack_grasp",
     "verify_grasp",

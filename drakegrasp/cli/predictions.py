@@ -263,7 +263,7 @@ def _of_object(
 
     config, view, around = dg.load_config("fast", list(overrides)), seen.view, None
     if view is not None and seen.instances is not None and (simulate or arm is not None):
-        around = seen_neighbours(view, seen.instances, (), config)
+        around = seen_neighbours(view, seen.instances, config=config)
         if show:
             say(f"{counted(len(around.models), 'neighbour')} completed from the view", err=True)
     how: dict[str, Any] = {"simulate": simulate, "count": count, "arm": arm, "around": around}

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import manifold3d
 import numpy as np
 
+from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import (
@@ -227,11 +228,11 @@ def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -
     # The angle of each face around the edge, from its third corner.
     low, high = int(start.min()), int(end.max())
     axis = vertices[high] - vertices[low]
-    axis = axis / np.linalg.norm(axis)
+    axis = axis / norm(axis)
     arms = vertices[faces[face, (corner + 2) % 3]] - vertices[low]
     first = np.cross(axis, arms[0])
     second = np.cross(axis, first)
-    angles = np.round(np.arctan2(arms @ second, arms @ first) % (2.0 * np.pi), 6)
+    angles = np.round(np.arctan2(dot(arms, second), dot(arms, first)) % (2.0 * np.pi), 6)
     angles[angles >= 6.283185] = 0.0
 
     # Around the axis, the solid ends at a face whose half-edge has the axis' direction, and begins
@@ -261,6 +262,8 @@ def face_components(twins: Faces, face_count: int) -> tuple[int, Faces]:
 PLANAR = 0.05
 #: ... and small if its size is below this fraction of the object's diagonal.
 SMALL_RIM = 0.15
+#: A rim has an area if it is larger than this fraction of the square of its radius.
+SLIT = 1e-6
 
 
 def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
@@ -275,19 +278,16 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
     """
     # Large rims come first, so that an outer rim comes before the inner rims in its plane.
     vertices = component.vertices
-    rims = sorted(_rims(component), key=lambda r: -float(np.linalg.norm(_area_vector(vertices[r]))))
+    rims = sorted(_rims(component), key=lambda r: -float(norm(_area_vector(vertices[r]))))
     lids: list[Faces] = []
     holes = 0
     while rims:
-        # The least-squares plane through the rim, with its normal towards the missing side.
+        # A plane through the rim, with its normal towards the missing side.
         outer = rims.pop(0)
         points = vertices[outer]
         centre, width = points.mean(axis=0), diagonal(points)
-        basis = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
-        if np.dot(np.cross(basis[0], basis[1]), _area_vector(points)) < 0.0:
-            basis = basis[::-1]
-        normal = np.cross(basis[0], basis[1])
-        off_plane = float(np.abs((points - centre) @ normal).max())
+        basis, normal = _plane_axes(points - centre)
+        off_plane = float(np.abs(dot(points - centre, normal)).max())
         if off_plane > PLANAR * width and width > SMALL_RIM * size:
             raise MeshError(
                 f"open edges must surround a flat or a small hole, got {len(outer)} that span "
@@ -296,12 +296,12 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
 
         # A second rim in the same plane, inside the first and in the opposite direction, is the
         # inner edge of a wall: the gap between the two rims is a ring.
-        flat = (points - centre) @ basis.T
+        flat = multiply(points - centre, basis.T)
         loops, polygons = [outer], [flat]
         for rim in list(rims):
-            local = (vertices[rim] - centre) @ basis.T
-            away = np.abs((vertices[rim] - centre) @ normal).max()
-            backward = float(np.dot(_area_vector(vertices[rim]), normal)) < 0.0
+            local = multiply(vertices[rim] - centre, basis.T)
+            away = np.abs(dot(vertices[rim] - centre, normal)).max()
+            backward = float(dot(_area_vector(vertices[rim]), normal)) < 0.0
             if away < 1e-3 * width and backward and _inside_polygon(local[0], flat):
                 loops.append(rim)
                 polygons.append(local)
@@ -346,6 +346,25 @@ def _area_vector(points: Array) -> Array:
     """Return the vector area (3,) [m^2] of a closed polygon (n, 3)."""
     centred = points - points.mean(axis=0)
     return np.asarray(np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0) / 2.0)
+
+
+def _plane_axes(points: Array) -> tuple[Array, Array]:
+    """Return two axes (2, 3) and the normal (3,) of the plane of a rim (n, 3) about its mean.
+
+    The normal is the direction of the rim's area. A rim without an area is a slit: its normal is
+    across the direction to its farthest point.
+    """
+    area, far = _area_vector(points), points[np.argmax(norm(points))]
+    slit = norm(area) <= SLIT * norm(far) ** 2
+    normal = _across(far) if slit else area / norm(area)
+    first = _across(normal)
+    return np.array([first, np.cross(normal, first)]), normal
+
+
+def _across(direction: Array) -> Array:
+    """Return a unit vector (3,) across a direction (3,), by the axis that is least along it."""
+    found = np.cross(np.eye(3)[np.argmin(np.abs(direction))], direction)
+    return np.asarray(found / norm(found))
 
 
 def _inside_polygon(point: Array, polygon: Array) -> bool:

@@ -270,7 +270,7 @@ def resting_hull(points: Array) -> Solid:
         # The inner point is the centroid: facets are convex.
         corners = vertices[border]
         weights = face_areas(vertices, facet)
-        centroid = weights @ vertices[facet].mean(axis=1) / weights.sum()
+        centroid = dot(vertices[facet].mean(axis=1).T, weights) / weights.sum()
 
         # A rim of narrow triangles between the border and a ring of a few of its corners.
         size = min(len(border), RING)

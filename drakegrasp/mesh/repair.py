@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from drakegrasp.arithmetic import norm
+from drakegrasp.arithmetic import dot, norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import (
@@ -233,7 +233,7 @@ def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
     bits = (np.arange(2 ** len(doubtful))[:, None] >> np.arange(len(doubtful))) & 1
     odd = ((bits @ table[:, doubtful].T) % 2).sum(axis=1)
     areas = np.bincount(patch, face_areas(vertices, faces), patch_count)[doubtful]
-    best = bits[np.lexsort((-(bits @ areas), odd))[0]]
+    best = bits[np.lexsort((-dot(bits, areas), odd))[0]]
     dropped = np.isin(patch, doubtful[best == 0])
     return faces[~dropped], faces[dropped]
 

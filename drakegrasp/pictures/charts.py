@@ -121,7 +121,8 @@ def draw_parts(
         labels = [f"{part}\nof {whole}" for part, whole in zip(parts, wholes, strict=True)]
         axes.bar_label(bars, labels, padding=3, color=INK, fontsize=8)
     axes.set_xticks(range(len(names)), names)
-    axes.set_ylim(0.0, 1.2)
+    axes.set_ylim(0.0, 1.2)  # room for the counts above a bar
+    axes.set_yticks(np.linspace(0.0, 1.0, 6))
     axes.set_xlabel(what)
     axes.legend(frameon=False, labelcolor=INK, loc="center left", bbox_to_anchor=(1.0, 0.5))
     _plain(axes)

@@ -253,7 +253,7 @@ def _predict_view(
     try:
         cloud, around = cloud_from_depth(view.depth, view.K, view.mask, view.X_TC), None
         if seen.instances is not None and (simulate or arm is not None):
-            around = seen_neighbours(view, seen.instances, seen.walls, config)
+            around = seen_neighbours(view, seen.instances, walls=seen.walls, config=config)
         how: dict[str, Any] = {"simulate": simulate, "count": count, "name": seen.name, "arm": arm}
         found, _ = predict(cloud, view, config, **how, around=around)
     except TooLittleSeenError:

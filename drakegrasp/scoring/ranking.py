@@ -43,7 +43,7 @@ from drakegrasp.simulation.closing import closing_features
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.posture import start_of
 from drakegrasp.simulation.scene_cache import run_cached
-from drakegrasp.table import AnyArray, Table
+from drakegrasp.table import Table
 from drakegrasp.vision.depth_image import View, cloud_from_depth, complete
 
 #: Moves of the palm along its axes [m] over which a score is averaged; the first is no move.
@@ -177,7 +177,8 @@ def rank(
     """
     if simulate < 0:
         raise GraspError(f"simulate must be a whole number, 0 or more, got {simulate}")
-    view, points = _read_view(view), read_cloud(cloud)
+    seen = None if view is None else _read_view(view)
+    points = read_cloud(cloud)
     hand = load_hand(config.hand_source) if hand is None and config else chosen_hand(hand)
     proposals = _read_proposals(proposals, hand, spread)
     starts = _starts(proposals, hand, spread)
@@ -192,9 +193,9 @@ def rank(
     # Lift the first ones.
     share, completion = np.full(len(score), np.nan), ""
     if tried := [i for i in order[:simulate].tolist() if known[i]]:
-        completed = place_completed(solids, view, lifting_config(hand, config), around)
+        completed = place_completed(solids, seen, lifting_config(hand, config), around)
         share[tried] = lift_shares(completed, [starts[i] for i in tried])
-        completion = "cloud" if view is None else "view"
+        completion = "cloud" if seen is None else "view"
     chance = np.where(known, chances(score, share), 0.0)
 
     # What the arm does not reach comes last.
@@ -215,19 +216,17 @@ def rank(
     )
 
 
-def _read_view(view: View | Sequence[npt.ArrayLike] | None) -> View | None:
+def _read_view(view: View | Sequence[npt.ArrayLike]) -> View:
     """Return a view whose depth image, mask and camera fit together.
 
     Raises:
         GraspError: If they do not.
     """
-    if view is None:
-        return None
     if len(view) != len(View._fields):
         raise GraspError(f"view must be {', '.join(View._fields)}, got {len(view)} values")
-    view = View(*view)
-    cloud_from_depth(view.depth, view.K, view.mask, view.X_TC)
-    return view
+    read = View(*view)
+    cloud_from_depth(read.depth, read.K, read.mask, read.X_TC)
+    return read
 
 
 def _reaches(
@@ -393,23 +392,35 @@ def place_completed(
 
 
 def seen_neighbours(
-    view: View, instances: AnyArray, walls: Sequence[Wall], config: Config
+    view: View | Sequence[npt.ArrayLike],
+    instances: npt.ArrayLike,
+    *,
+    walls: Sequence[Wall] = (),
+    config: Config | None = None,
 ) -> Neighbourhood:
-    """Return what is around an object, as far as an image shows it, in {T}.
+    """Return what is around an object, as far as an image shows it, in {T}, for `rank`.
+
+    A neighbour of which the image shows too little is left out.
 
     Args:
-        view: The image, whose mask shows the object.
+        view: As for `rank`; its mask shows the object.
         instances: (h, w), another value on each object, 0 beside all.
         walls: Walls that are known.
-        config: The configuration of the lifts, with the mass of a neighbour.
+        config: The configuration of the lifts, with the mass of a neighbour; None for the preset
+            `fast`.
 
     Raises:
-        GraspError: If a neighbour is not on the table.
+        GraspError: If the view or the instances are invalid, or a neighbour is not on the table.
         MeshError: If a neighbour cannot be simulated.
     """
+    seen, labels = _read_view(view), np.asarray(instances)
+    if labels.shape != (size := np.shape(seen.depth)):
+        must = f"instances must be of the size {size} of the depth image"
+        raise GraspError(f"{must}, got {labels.shape}")
+    config = load_config("fast") if config is None else config
     found = list[PlacedObject]()
-    for value in np.unique(instances[(instances != 0) & (view.mask == 0)]).tolist():
-        own = view._replace(mask=(instances == value).astype(np.uint8))
+    for value in np.unique(labels[(labels != 0) & (np.asarray(seen.mask) == 0)]).tolist():
+        own = seen._replace(mask=(labels == value).astype(np.uint8))
         try:
             solid = hull_solid(read_cloud(cloud_from_depth(own.depth, own.K, own.mask, own.X_TC)))
             found += place_completed([solid], own, config)

@@ -357,7 +357,7 @@ def _add_hull(
     text = obj_text(points, model.collision_faces, normals=False)
     hull = Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "hull")), 1.0)
     if not accepts_hull(hull):
-        text = hull_text(points[np.unique((points @ HULL_DIRECTIONS.T).argmax(axis=0))])
+        text = hull_text(points[np.unique(multiply(points, HULL_DIRECTIONS.T).argmax(axis=0))])
         hull = Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "hull")), 1.0)
     plant.RegisterCollisionGeometry(body, RigidTransform(), hull, "hull", properties)
 

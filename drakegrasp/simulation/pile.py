@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drakegrasp.arithmetic import multiply
+from drakegrasp.arithmetic import dot, multiply
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError, first_line
 from drakegrasp.frames import X_WT, Array, make_pose, rotation_about, transform_points
@@ -104,7 +104,7 @@ def _lower(scene: ObjectScene, X_TN: Array, surroundings: Surroundings, stream: 
     """Put the object, turned at random, just above what it meets when it is lowered."""
     u = stream.uniform(2)
     R_TO = rotation_of(stream.normal(4))
-    lowest = float((scene.model.collision_vertices @ R_TO[2]).min())
+    lowest = float(dot(scene.model.collision_vertices, R_TO[2]).min())
     tops = [
         transform_points(X, each.model.collision_vertices)[:, 2].max()
         for each, X in zip(scene.neighbours, X_TN, strict=True)

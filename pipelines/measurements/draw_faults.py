@@ -15,8 +15,8 @@ Each room gets equally many faults. In a room first the kind is drawn, then the 
 kinds are as frequent as common ones. Texts of messages and annotations stay unchanged, and so do
 the numbers of pages and pictures, which are layout. The same seed draws the same faults from the
 same source. The tests of a fault are those of its module, then others of its room, then tests of
-other rooms that import the module. Faults that were examined and change no result are listed in
-`equivalent_faults.yaml`; they are not drawn.
+other rooms that import the module, then those of the whole package. Faults that were examined and
+change no result are listed in `equivalent_faults.yaml`; they are not drawn.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ LAYOUT = ("page", "pictures")
 NEAR = 1
 #: Maximum number of test files for a fault.
 MOST_TESTS = 16
+#: Tests of what comes out of all rooms.
+WHOLE = ("tests/test_numbers.py", "tests/test_pins.py", "tests/test_equal_draws.py")
 #: An option of pytest that selects the tests that `make test` runs.
 FIRST_TIER = "-mnot server and not nightly and not browser"
 _BOUNDS: dict[type[ast.AST], str] = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
@@ -157,7 +159,7 @@ def faults_of(name: str) -> Iterator[dict[str, object]]:
                 "line": node.lineno,
                 "old": b"".join(lines[first : last + 1]).decode(),
                 "new": f"{head}{new}{tail}",
-                "tests": [*tests, FIRST_TIER],
+                "tests": [*dict.fromkeys((*tests, *WHOLE)), FIRST_TIER],
             }
 
 

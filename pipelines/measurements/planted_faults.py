@@ -13,11 +13,13 @@ import importlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
@@ -124,15 +126,17 @@ def run_tests(folder: Path, tests: Sequence[str], timeout: float) -> tuple[int, 
         )
         child.start()
         child.join(HANG * timeout)
-        if child.is_alive():
-            child.kill()
-            child.join()
+        # With the processes that the tests have started, also those that they left.
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid or 0, signal.SIGKILL)
+        child.join()
         output.seek(0)
         code = child.exitcode
         return KILLED if code is None or code < 0 else code, output.read().decode(errors="replace")
 
 
 def _run(folder: Path, tests: list[str], timeout: float, output: int) -> None:
+    os.setsid()
     for stream in (1, 2):
         os.dup2(output, stream)
     os.chdir(folder)

@@ -64,13 +64,17 @@ def digest(*parts: object) -> str:
 
 
 def objects(folder: Path, meshes: Path | None) -> Iterator[MeshSource]:
-    """Yield a cube, a cylinder, a block and, where they are, three real meshes."""
+    """Yield a cube, a cylinder, a block, a pipe and, where they are, three real meshes."""
     cube, cylinder = trimesh.creation.box([0.07] * 3), trimesh.creation.cylinder(0.03, 0.12)
     cylinder.vertices = np.round(cylinder.vertices, 6)  # trimesh's own sines
     # So large that the grid of its distance field is not the finest one.
     block = trimesh.creation.box([0.18, 0.13, 0.15])
     for name, mesh in (("1_cube", cube), ("2_cylinder", cylinder), ("3_block", block)):
         mesh.subdivide().subdivide().export(folder / f"{name}.stl")
+    # Open at both ends, with two square rims of one size.
+    pipe = trimesh.creation.box([0.1, 0.06, 0.06]).subdivide().subdivide()
+    pipe.update_faces(np.abs(pipe.face_normals[:, 0]) < 0.5)
+    pipe.export(folder / "4_pipe.stl")
     yield from find_meshes(folder)
     if meshes is not None:
         yield from (s for s in find_meshes(meshes, units="cm") if s.name in REAL)
@@ -87,7 +91,8 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
             candidates, range(len(candidates)), config.candidates, name=source.name, seed=7
         )
     )
-    yield "mesh", digest(model.visual_vertices, model.collision_vertices, model.collision_faces)
+    shape = model.visual_vertices, model.visual_faces
+    yield "mesh", digest(*shape, model.collision_vertices, model.collision_faces)
     # The resting pose is simulated, so its last bits differ between machines. Of that of the
     # cylinder, which may turn about its axis, only height and upward direction are compared.
     compared = rest[2] if source.name == "2_cylinder" else rest

@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -145,3 +148,64 @@ def flat(value: Any, name: str = "") -> Iterator[str]:
             yield from flat(part, f"{name}/{number}")
     else:
         yield f"{name} = {value!r}"
+
+
+# Values of any kind.
+
+#: An array of more numbers is told by its means.
+FEW = 8
+
+
+def told(value: Any, name: str = "") -> str:
+    """Return lines with all numbers and words of a value; a large array has a line of means."""
+    return "\n".join(_lines(value, name))
+
+
+def _lines(value: Any, name: str) -> Iterator[str]:
+    if isinstance(value, Enum):
+        value = value.name
+    if hasattr(value, "model_dump"):
+        value = value.model_dump()
+    if is_dataclass(value):
+        value = {f.name: getattr(value, f.name) for f in fields(value)}
+    if isinstance(value, Mapping):
+        for key in value:
+            yield from _lines(value[key], f"{name}/{key}" if name else str(key))
+    elif isinstance(value, np.ndarray) and value.dtype.names:
+        yield from _lines({part: value[part] for part in value.dtype.names}, name)
+    elif _is_numbers(value):
+        yield f"{name}: {_numbers(np.asarray(value))}"
+    elif isinstance(value, list | tuple | np.ndarray):
+        if all(isinstance(each, str) for each in value):
+            yield f"{name}: {dict(Counter(value)) if len(value) > FEW else [*value]}"
+        else:
+            for number, each in enumerate(value):
+                yield from _lines(each, f"{name}/{number}")
+    elif isinstance(value, str | None):
+        yield f"{name}: {value!r}"
+
+
+def _is_numbers(value: Any) -> bool:
+    try:
+        return np.asarray(value).dtype.kind in "biuf"
+    except ValueError:  # of several lengths
+        return False
+
+
+def _numbers(value: np.ndarray) -> str:
+    """Return an array as text: its shape, then its values, or three means and what is not finite.
+
+    The means are of values, of sizes, and of values with weights that grow from row to row.
+    """
+    if value.size <= FEW:
+        return f"{value.shape} {' '.join(map(_number, value.ravel().tolist()))}"
+    flat = value.ravel().astype(float)
+    here = np.isfinite(flat)
+    known, weight = flat[here], np.linspace(0.0, 1.0, flat.size)[here]
+    lost = f" without {flat.size - len(known)}" if len(known) < flat.size else ""
+    sums = known.sum(), np.abs(known).sum(), known @ weight
+    return f"{value.shape}{lost} {' '.join(short(each / max(len(known), 1)) for each in sums)}"
+
+
+def _number(value: float) -> str:
+    return short(value) if isinstance(value, float) and np.isfinite(value) else str(value)

@@ -16,7 +16,6 @@ from drakegrasp.dataset.scenes import SceneDataset, SceneRows
 from drakegrasp.frames import unpack_pose
 from drakegrasp.scoring import ranking
 from drakegrasp.scoring.predicting import _predict_view, _SceneView, predict, predict_scenes
-from drakegrasp.scoring.ranking import seen_neighbours
 from drakegrasp.simulation.attempt import Attempt
 from drakegrasp.simulation.fixtures import load_surroundings
 from drakegrasp.verification.placing import dataset_config, place_on_rows
@@ -168,13 +167,17 @@ def test_grasps_are_for_the_objects_of_the_rows(rows: SceneRows) -> None:
 def test_the_others_are_completed_from_the_view(
     rows: SceneRows, first: tuple[View, np.ndarray]
 ) -> None:
-    walls = load_surroundings("bin").walls
-    around = seen_neighbours(*first, walls, dataset_config(rows))
+    (view, instances), walls = first, load_surroundings("bin").walls
+    around = dg.seen_neighbours(
+        [each.tolist() for each in view], instances, walls=walls, config=dataset_config(rows)
+    )
     (model,), (X_TN,) = around.models, around.X_TN
     assert around.walls == walls
     due = load_scene(rows.path, int(rows.scenes[0])).X_TO[1 - int(rows.places[0])]
     assert np.linalg.norm(X_TN[:3, 3] - due[:3, 3]) < 0.03
     assert 0.04 < 2.0 * model.half_extents.max() < 0.2
+    with pytest.raises(dg.GraspError, match=r"instances must be of the size .*, got \(1, 2\)"):
+        dg.seen_neighbours(view, [[0, 1]])
 
 
 @pytest.mark.sim
@@ -184,7 +187,7 @@ def test_a_neighbour_in_the_way_counts_if_grasps_are_lifted(
     """The same neighbour far away and where the best palm is."""
     (own, mask), config = first, dataset_config(rows)
     cloud = dg.cloud_from_depth(own.depth, own.K, own.mask, own.X_TC)
-    around = seen_neighbours(own, mask, (), config)
+    around = dg.seen_neighbours(own, mask, config=config)
     proposed = dg.propose(cloud)
     best = int(dg.rank(proposed, cloud, config=config).order[0])
     one = proposed.at([best])

@@ -9,7 +9,7 @@ import pytest
 
 import drakegrasp as dg
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.frames import rotate_vectors, transform_points, unpack_pose
+from drakegrasp.frames import invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.scoring import references
 from drakegrasp.scoring.references import REFERENCES, ReferenceInput
@@ -66,6 +66,32 @@ def test_a_grasp_from_above_closes_level_across_the_object(inputs):
         # Each contact is on the side to which its normal points.
         middle = p_TQ.mean(axis=0)
         assert (((p_TQ - middle) * nhat_Q_T).sum(axis=1) > 0.0).all()
+
+
+def test_a_grasp_from_above_is_across_the_short_side_of_what_is_seen(inputs, monkeypatch):
+    """The object is a box of 100 by 20 by 50 mm, 30 degrees about z from the axes of {T}."""
+    x, y, z = np.meshgrid(np.linspace(-0.05, 0.05, 21), [-0.01, 0.01], [0.0, 0.05])
+    long, short = np.array([np.sqrt(0.75), 0.5, 0.0]), np.array([-0.5, np.sqrt(0.75), 0.0])
+    middle = np.array([0.02, 0.03, 0.0])
+    p_TQ = middle + np.stack([x, y], axis=-1).reshape(-1, 2) @ np.stack([long, short])
+    p_TQ[:, 2] = z.ravel()
+    poses = unpack_pose(inputs.data.column("object_props/frame_work2cam_oto"))
+    monkeypatch.setattr(
+        ReferenceInput, "visible", lambda _, row: transform_points(invert_pose(poses[row]), p_TQ)
+    )
+    points, normals = unpack_grasp(references.top_down(inputs)[0])
+    points, normals = transform_points(poses[0], points), rotate_vectors(poses[0], normals)
+    np.testing.assert_allclose(np.abs(normals @ short), 1.0, atol=1e-6)
+    np.testing.assert_allclose((points - middle) @ short, 0.01 * normals @ short, atol=1e-6)
+    np.testing.assert_allclose(points[:, 2], 0.025, atol=1e-6)
+    along = (points - middle) @ long
+    assert along[inputs.thumb] == pytest.approx(0.0, abs=1e-6)
+    others = np.delete(along, inputs.thumb)
+    np.testing.assert_allclose(
+        np.sort(others),
+        [-0.5 * references.FINGER_SPACING, 0.5 * references.FINGER_SPACING],
+        atol=1e-6,
+    )
 
 
 def test_closing_gives_the_posture_that_is_ranked_first_for_what_is_seen(inputs):
