@@ -98,6 +98,15 @@ def test_a_split_by_object_has_no_classes_to_train_and_leaves_some_objects_to_tr
     assert load_config("paper", large).split.valid_fraction == 0.4
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("randomize.mass", [2.0, 2.0]), ("candidates.standoffs", [1.0]), ("filters.max_slip", 0.01)],
+)
+def test_limit_itself_is_allowed(key: str, value: object) -> None:
+    config = load_config("fast", [f"{key}={value}"])
+    assert dict(leaves(config.to_dict()))[key] == value
+
+
 def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> None:
     values = dict(leaves(load_config("released").to_dict()))
     assert values == {**DEFAULT_VALUES, **CASES["released"]}

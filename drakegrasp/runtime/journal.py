@@ -291,10 +291,8 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
         history.crash_loop = int(content["crash_loop"])
         passed, step = rest[:_RECORD_SIZE].decode("ascii").split(maxsplit=1)
         history.add(step.strip(), int(passed, 16), rest[_RECORD_SIZE:])
-    except FileNotFoundError:
-        return _History()
-    except (KeyError, TypeError, ValueError):
-        return _History()  # another version wrote the file
+    except (FileNotFoundError, KeyError, TypeError, ValueError):
+        return _History()  # there was no run, or another version wrote the file
     return history
 
 

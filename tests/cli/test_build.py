@@ -228,6 +228,8 @@ def test_build_connects_with_the_certificates_that_it_is_given(
 
 # What is known of a build beforehand.
 
+EACH = ("--samples-per-object", "5")
+
 
 def dry_run(out: Path, *words: str | Path) -> Result:
     return run("build", "--objects", "builtin", "--out", out, "--dry-run", *words)
@@ -246,6 +248,17 @@ def dry_run(out: Path, *words: str | Path) -> Result:
         (
             ("--only", "1_mug_1", "--only", "1_mug_1", "--candidates", "101"),
             ["1 object: at most 101 palm poses in 13 work units"],
+        ),
+        (
+            (*("--only", "1_mug_1", "--candidates", "100", "--samples", "7"), *EACH),
+            [
+                "1 object: until 7 samples or 5 samples of each, at most 100 palm poses in "
+                "13 work units"
+            ],
+        ),
+        (
+            ("--only", "1_mug_1", "--candidates", "100", "--samples", "7"),
+            ["1 object: until 7 samples, at most 100 palm poses in 13 work units"],
         ),
     ],
 )

@@ -34,11 +34,11 @@ def test_first_reason_counts() -> None:
         ({}, "in_view", True, False, Removal.OUT_OF_VIEW),
         ({}, "camera_height", 0.011, 0.009, Removal.BISECTS_TABLE),
         ({}, "camera_height", 0.011, -0.2, Removal.BISECTS_TABLE),
-        ({"min_camera_height": 0.2}, "camera_height", 0.201, 0.199, Removal.BISECTS_TABLE),
+        ({"min_camera_height": 0.2}, "camera_height", 0.2, 0.199, Removal.BISECTS_TABLE),
         ({}, "depth_variance", 1.01e-3, 0.99e-3, Removal.FLAT_DEPTH),
-        ({"min_depth_variance": 0.005}, "depth_variance", 0.0051, 0.0049, Removal.FLAT_DEPTH),
+        ({"min_depth_variance": 0.005}, "depth_variance", 0.005, 0.0049, Removal.FLAT_DEPTH),
         ({}, "surface_distance", 1.9e-3, 2.1e-3, Removal.OFF_SURFACE),
-        ({"max_surface_distance": 5e-3}, "surface_distance", 4.9e-3, 5.1e-3, Removal.OFF_SURFACE),
+        ({"max_surface_distance": 5e-3}, "surface_distance", 5e-3, 5.1e-3, Removal.OFF_SURFACE),
         ({"max_surface_distance": 5e-4}, "surface_distance", 4e-4, 6e-4, Removal.OFF_SURFACE),
         ({}, "normal_angle", np.deg2rad(29.0), np.deg2rad(31.0), Removal.NORMAL_OFF),
         ({"max_normal_angle_deg": 50.0}, "normal_angle", 0.87, 0.88, Removal.NORMAL_OFF),
@@ -46,11 +46,11 @@ def test_first_reason_counts() -> None:
         ({"other_links": 3}, "other_links", 3, 4, Removal.OTHER_LINKS),
         ({}, "slip", 0.0099, 0.0101, Removal.SLID),
         ({}, "slip", 0.0, np.nan, Removal.SLID),
-        ({"max_slip": 0.02}, "slip", 0.0199, 0.0201, Removal.SLID),
+        ({"max_slip": 0.02}, "slip", 0.02, 0.0201, Removal.SLID),
         ({}, "turn", np.deg2rad(9.9), np.deg2rad(10.1), Removal.TURNED),
         ({"max_turn_deg": 50.0}, "turn", 0.87, 0.88, Removal.TURNED),
         ({}, "anomaly", 0.1, 0.3, Removal.KEPT),
-        ({"max_anomaly": 0.2}, "anomaly", 0.1, 0.3, Removal.ANOMALOUS),
+        ({"max_anomaly": 0.25}, "anomaly", 0.25, 0.3, Removal.ANOMALOUS),
         ({"max_anomaly": 0.2}, "anomaly", 0.1, np.nan, Removal.ANOMALOUS),
         ({"max_penetration": 0.2}, "penetration", 0.1, 0.3, Removal.ANOMALOUS),
         ({"max_imbalance": 0.2}, "imbalance", 0.1, 0.3, Removal.ANOMALOUS),
@@ -70,7 +70,10 @@ def test_first_reason_counts() -> None:
 def test_each_limit_is_the_configured_one(
     settings: dict[str, Any], field: str, kept: float, removed: float, reason: Removal
 ) -> None:
-    """Values of which the usual limit would judge at least one otherwise, if another is set."""
+    """Values of which the usual limit would judge at least one otherwise, if another is set.
+
+    A value at the limit is kept.
+    """
     values = np.array([kept, removed, kept], dtype=good(3)[field].dtype)
     found = judge(good(3).with_columns(**{field: values}), FilterConfig(**settings))
     assert found.tolist() == [Removal.KEPT, reason, Removal.KEPT]

@@ -140,6 +140,22 @@ def test_assembly_drops_exactly_the_rejected(client: TestClient, out: Path) -> N
     assert decide(again, "2-0-0", "rejected").json()["counts"] == {"rejected": 3, "samples": 1}
 
 
+def test_arrows_lead_through_all_rows_and_back(client: TestClient) -> None:
+    def follow(arrow: str, address: str) -> list[str]:
+        places = []
+        while address:
+            page = Tags(client.get(address).text)
+            places += re.findall(r"\d+ of 9", page.text)
+            links = [a["href"] for _, a in page.tags if a.get("id") == arrow]
+            address = (links or [""])[0] or ""
+        return places
+
+    order = [f"{k} of 9" for k in range(1, 10)]
+    rows = [a["data-label"] for tag, a in Tags(client.get("/").text).tags if tag == "li"]
+    assert follow("next", f"/grasp/{rows[0]}") == order
+    assert follow("previous", f"/grasp/{rows[-1]}") == order[::-1]
+
+
 def test_an_edited_file_is_not_overwritten(client: TestClient, out: Path) -> None:
     decide(client, "0-0-0", "rejected")
     (out / "reject.json").write_text('{"version": 1, "rejected": [], "kept": []}')

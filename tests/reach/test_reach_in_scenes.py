@@ -199,7 +199,8 @@ def test_a_row_per_free_grasp_as_in_its_scene(asked: Path, straight: dg.Arm) -> 
             around=there.around(i),
         )
         assert REACHES[found.reach_outcome[row]] == due.outcome
-        np.testing.assert_allclose(found.q_grasp[row], due.q[1], atol=1e-6)
+        q = [found[name][row] for name in ("q_approach", "q_grasp", "q_lift")]
+        np.testing.assert_allclose(q, due.q, atol=1e-6)
         np.testing.assert_allclose(found.clearance[row], due.clearance, atol=1e-6)
     assert not check_dataset(asked)
 
