@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 import numpy.typing as npt
 
 from drakegrasp.api.verifying import run_verification, verify_by_protocol
-from drakegrasp.cluster.executor import DaskExecutor
-from drakegrasp.cluster.worker_checks import checked_workers
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes import SceneRows
@@ -95,6 +93,9 @@ def predict_scenes(
         if client is None:
             execute = stack.enter_context(processes(workers))
         else:
+            from drakegrasp.cluster.executor import DaskExecutor
+            from drakegrasp.cluster.worker_checks import checked_workers
+
             config = override_config(read_manifest(path.parent).config, overrides)
             stack.enter_context(checked_workers(client, config))
             execute = DaskExecutor(client)
