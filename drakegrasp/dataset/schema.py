@@ -669,8 +669,8 @@ SCENE_FIELDS: tuple[Field, ...] = (
           "objects; may differ in attempts", "o", some=True),
     Field("friction_table", "float64", "effective coefficients of friction between table and "
           "objects; may differ in attempts", "o", some=True),
-    Field("surroundings", "str", "name of the boxes around the objects, see the attribute of the "
-          "file; only in clutter.hdf5", optional=True),
+    Field("surroundings", "str", "name of the surroundings of the objects, see the attribute of "
+          "the file; only in clutter.hdf5", optional=True),
     Field("seed", "uint64", "state of the random stream of the scene; only in clutter.hdf5",
           optional=True),
 )

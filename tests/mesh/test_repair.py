@@ -45,6 +45,15 @@ def apart() -> trimesh.Trimesh:
     return trimesh.Trimesh(corners, np.arange(36).reshape(-1, 3), process=False)
 
 
+def cracked() -> trimesh.Trimesh:
+    """Return a box with an edge that only one of its two faces divides: a hole without an area."""
+    mesh = box()
+    a, b, c = mesh.faces[0]
+    middle = np.append(mesh.vertices, [mesh.vertices[[a, b]].mean(axis=0)], axis=0)
+    m = len(mesh.vertices)
+    return trimesh.Trimesh(middle, [[a, m, c], [m, b, c], *mesh.faces[1:]], process=False)
+
+
 def beside(at: float, flip: bool = False) -> list[trimesh.Trimesh]:
     """Return two cubes that touch or overlap, the second of which may be inside out."""
     other = box((0.04,) * 3, (at, 0.0, 0.0))
@@ -63,6 +72,7 @@ REPAIRED: dict[str, tuple[list[trimesh.Trimesh], float, str]] = {
     "a face turned": ([one_face_turned()], VOLUME, "1 of 12 faces ran against their neighbours"),
     "no lid": ([open_box()], VOLUME, f"1 open rims were closed, {LID:.1%} of the surface: solid"),
     "open between two walls": ([tube()], 0.1 * RING, "2 open rims were closed"),
+    "an edge that one side divides": ([cracked()], VOLUME, "1 open rims were closed, 0.0% of"),
     "bodies that overlap": (beside(0.06), 1e-3 + 0.03 * 0.04**2, "2 bodies were united into one"),
     "one of them inside out": (
         beside(0.06, flip=True),
