@@ -361,6 +361,10 @@ def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, wo
     assert "\n" not in str(caught.value)
 
 
+#: What a file has that we export.
+EXPORTED = {"joint_units": ["rad"] * 16}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -370,6 +374,9 @@ def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, wo
         ({"obj_pose": np.zeros(8)}, r"obj_pose must be 7 numbers for 1 or 1, got \(1, 8\)"),
         ({"obj_pose": np.zeros((3, 7))}, r"obj_pose must be 7 numbers .*, got \(3, 7\)"),
         ({"squeeze_qpos": np.zeros((2, 23))}, "the postures must have equal lengths"),
+        (EXPORTED | {"conditions": [1.0, 2.0]}, r"conditions must be 3 numbers, got \(2,\)"),
+        (EXPORTED | {"start_qpos": [0.1]}, r"start_qpos must be 16 numbers, got \(1,\)"),
+        (EXPORTED | {"trial_id": 1.5}, "trial_id must be a whole number, got 1.5"),
     ],
 )
 def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes, words):
