@@ -1,7 +1,8 @@
-"""The numbers that each room makes of fixed inputs are those in `tests/golden/numbers`.
+"""The numbers that the rooms make of fixed inputs are those in `tests/golden/numbers`.
 
-Other tests say why a number must be so; these notice whatever else changes. Simulated numbers are
-compared to a thousandth, see docs/explanation/determinism.md.
+Other tests say why a number must be so; these notice whatever else changes. Numbers are compared to
+a thousandth, or to 1e-6, because other CPUs simulate others, see docs/explanation/determinism.md.
+Pages, figures, commands and job scripts have golden tests of their own.
 """
 
 from __future__ import annotations
@@ -97,9 +98,9 @@ def spoilt_meshes() -> Iterator[tuple[str, trimesh.Trimesh]]:
 
 
 @pytest.fixture(scope="module")
-def wedge(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+def block(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
     """A box without equal edges."""
-    return box_model(tmp_path_factory.mktemp("wedge"), [0.05, 0.06, 0.1])
+    return box_model(tmp_path_factory.mktemp("block"), [0.05, 0.06, 0.1])
 
 
 def test_meshes(tmp_path: Path, golden: Golden) -> None:
@@ -196,15 +197,15 @@ def standing_palm() -> np.ndarray:
     return make_pose(R, [0.02, -0.03, 0.15])
 
 
-def test_palms(wedge: ObjectModel, golden: Golden) -> None:
+def test_palms(block: ObjectModel, golden: Golden) -> None:
     """Attempts as drawn, and what geometry says of them."""
     found: dict[str, Any] = {}
     for preset, hand in (("fast", "barrett"), ("paper", "franka"), ("randomized", "allegro")):
         config = dg.load_config(preset, ["candidates.max=24"], hand=hand)
-        X_TO = standing(wedge)
-        attempts = list(drawn_attempts(wedge, X_TO, config))
-        screened = screen(wedge, dg.load_hand(hand), X_TO, attempts, config.screen)
-        drawn = [draw_conditions(wedge, config, each.candidate, 0) for each in attempts[:4]]
+        X_TO = standing(block)
+        attempts = list(drawn_attempts(block, X_TO, config))
+        screened = screen(block, dg.load_hand(hand), X_TO, attempts, config.screen)
+        drawn = [draw_conditions(block, config, each.candidate, 0) for each in attempts[:4]]
         found[preset] = {
             "X_OG": np.array([each.X_OG for each in attempts]),
             "rest": [(each.spread, each.standoff, each.preshape) for each in attempts[:6]],
@@ -216,27 +217,27 @@ def test_palms(wedge: ObjectModel, golden: Golden) -> None:
     golden("numbers/palms", told(found))
 
 
-def test_closing_by_geometry(wedge: ObjectModel, golden: Golden) -> None:
-    solid, found = hull_solid(wedge.visual_vertices), {}
+def test_closing_by_geometry(block: ObjectModel, golden: Golden) -> None:
+    solid, found = hull_solid(block.visual_vertices), {}
     for name in ("barrett", "allegro", "franka"):
         hand, turn = dg.load_hand(name), rotation_about([0.1, 0.2, 1.0], 0.7)
         X_SG = np.array([make_pose(R_OG0, [0.0, y, 0.05 + hand.standoffs[0]]) for y in (0.0, 0.01)])
         X_SG[1, :3, :3] = X_SG[1, :3, :3] @ turn
-        X_TS = standing(wedge)
+        X_TS = standing(block)
         found[name] = {
             "features": closing_features(solid, hand, 0.2, X_SG, X_TS=X_TS),
             "positions": closing_positions(solid, hand, 0.2, X_SG),
-            "centred": centred(wedge, hand, [Attempt(X_OG=X, spread=0.2) for X in X_SG]),
+            "centred": centred(block, hand, [Attempt(X_OG=X, spread=0.2) for X in X_SG]),
         }
     golden("numbers/closing", told(found))
 
 
 @pytest.mark.parametrize("name", ["barrett", "franka", "allegro", "leap"])
-def test_trials(name: str, wedge: ObjectModel, golden: Golden) -> None:
+def test_trials(name: str, block: ObjectModel, golden: Golden) -> None:
     """The best proposals for an object, as trials."""
     config = dg.load_config("fast", hand=name)
     placed = dg.place_object(trimesh.creation.box([0.05, 0.06, 0.1]), config=config)
-    cloud = transform_points(placed.X_TO, wedge.visual_vertices)
+    cloud = transform_points(placed.X_TO, block.visual_vertices)
     proposed = dg.propose(cloud, name)
     ranking = dg.rank(proposed, cloud, name)
     chosen = proposed.at(ranking.order[:2].tolist())
@@ -276,7 +277,7 @@ def test_reach(sound: Path, tmp_path: Path, golden: Golden) -> None:
 
 
 def test_exports(sound: Path, tmp_path: Path, golden: Golden) -> None:
-    """Every format: its text, and the numbers of its arrays."""
+    """Every format: the arrays of its files, and the numbers with decimals in their texts."""
     found: dict[str, Any] = {}
     for form in sorted(registry.names("exporters")):
         said = {"licence": "cc-by-4.0"} if "licence" in options_of(form) else {}
@@ -287,7 +288,7 @@ def test_exports(sound: Path, tmp_path: Path, golden: Golden) -> None:
 
 
 def content(path: Path) -> Any:
-    """Return what a file of an export holds; of a long text its numbers."""
+    """Return the arrays of a file of an export, or the numbers of a text; None for other files."""
     if path.suffix in (".npy", ".npz"):
         arrays = np.load(path, allow_pickle=True)
         return arrays.item() if isinstance(arrays, np.ndarray) else dict(arrays)

@@ -163,8 +163,9 @@ def score(
             is given.
 
     Raises:
-        GraspError: If predictions and rows do not match, there is nothing to score, or `train` is
-            of another camera or hand.
+        GraspError: If predictions and rows do not match, there is nothing to score, a reference is
+            unknown, or `train` is of another camera or hand.
+        ConfigError: If there is no such protocol, or it cannot have these rows, an arm or a client.
         ConfigError, DataError, HandError, MachineError: As `run_verification`.
     """
     unknown = [name for name in references if name not in REFERENCES]
@@ -173,8 +174,9 @@ def score(
 
     # The rules of the score, and the predictions.
     rules = _Rules(dataset, protocol, overrides, arm)
-    if rules.in_mujoco and (client or workers.get("scheduler") or workers.get("scheduler_file")):
-        raise ConfigError(f"scheduler must be None with protocol {rules.stored}, got one")
+    for where in ("client", "scheduler", "scheduler_file") if rules.in_mujoco else ():
+        if {"client": client, **workers}.get(where):
+            raise ConfigError(f"{where} must be None with protocol {rules.stored}, got one")
     settings = rules.settings()
     name, ranked = ranked_sets(
         predictions, dataset, rows=rows, confidence=confidence, read_as=read_as
@@ -243,9 +245,6 @@ class _Rules:
         stored: Its name on the card.
         in_mujoco: Whether grasps are tried in MuJoCo, on this machine.
         arm: The arm that is asked, if any.
-
-    Raises:
-        ConfigError: If there is no such protocol, or it cannot have these rows or an arm.
     """
 
     def __init__(

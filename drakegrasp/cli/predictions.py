@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
 #: Suffixes of scenes, and of files of postures that are written.
 HDF5 = (".h5", ".hdf5")
-#: Kinds of INPUT, and the options that each has.
+#: Kinds of INPUT, and the options that only they have.
 KINDS = {
-    "scenes": ("split", "workers", "arm"),
-    "a cloud": ("units", "arm"),
-    "a depth image": ("camera", "mask", "object_label", "camera_pose", "depth_scale", "arm"),
+    "scenes": ("split", "workers"),
+    "a cloud": ("units",),
+    "a depth image": ("camera", "mask", "object_label", "camera_pose", "depth_scale"),
 }
 #: Number of grasps for one object that lifts try if it is not given; scenes have many views.
 SIMULATED = 5
@@ -105,7 +105,7 @@ def predict(
 
     Grasps are proposed and ordered by closing the hand on the points. Then the first ones are
     tried by lifts in simulation, on the object completed from what was seen, until one holds in all
-    its lifts. The result also says if no grasp is likely to hold.
+    its lifts; for scenes only with --simulate. The command also says if no grasp is likely to hold.
 
     The grasps are written as a file of postures with a confidence each. `drakegrasp score` and
     `build --postures` take those of scenes. Those of a cloud are in the frame of the cloud, and
@@ -129,7 +129,7 @@ def predict(
     # All input is checked before anything is predicted.
     _validate_place(out, source)
     kind = _kind_of(source, image.camera)
-    options = {"split": split, "units": units, "workers": workers, "arm": robot.arm}
+    options = {"split": split, "units": units, "workers": workers}
     _validate_options(kind, options | vars(image))
     how: dict[str, Any] = {"overrides": overrides, "count": count, "show": not quiet}
     arm = how["arm"] = robot.asked()

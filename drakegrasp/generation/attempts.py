@@ -292,7 +292,8 @@ def judge_sample(
         trial: Trial of the grasp.
         config: Configuration, from which the filters and the camera are used.
         views: Whether to apply the filters of camera poses and of the contacts that a camera sees.
-            They do not apply to a palm with an error, because the image was taken before it.
+            They do not apply to a palm with an error, because the image was taken before it, and to
+            an object among others, which may be hidden.
 
     Returns:
         The filter; None for a trial that is not a success.

@@ -262,7 +262,8 @@ def face_components(twins: Faces, face_count: int) -> tuple[int, Faces]:
 PLANAR = 0.05
 #: ... and small if its size is below this fraction of the object's diagonal.
 SMALL_RIM = 0.15
-#: A rim has an area if it is larger than this fraction of the square of its radius.
+#: A rim has an area if it is larger than this fraction of the square of its farthest distance from
+#: its mean.
 SLIT = 1e-6
 
 
@@ -274,15 +275,16 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
         size: Diagonal of the whole object [m].
 
     Raises:
-        MeshError: If a rim is neither flat nor small, or crosses itself.
+        MeshError: If a rim is neither flat nor small, is large and crosses itself, or is no closed
+            loop.
     """
     # Large rims come first, so that an outer rim comes before the inner rims in its plane.
     vertices = component.vertices
     rims = sorted(_rims(component), key=lambda r: -float(norm(_area_vector(vertices[r]))))
     lids: list[Faces] = []
-    holes = 0
+    closed = 0
     while rims:
-        # A plane through the rim, with its normal towards the missing side.
+        # A plane through the rim, with its normal out of the solid.
         outer = rims.pop(0)
         points = vertices[outer]
         centre, width = points.mean(axis=0), diagonal(points)
@@ -316,8 +318,8 @@ def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
         if covered > 1.01 * abs(wanted) + 1e-6 * width**2 and width > SMALL_RIM * size:
             raise MeshError(f"the rim of a hole of {width * 1e3:.3g} mm must not cross itself")
         lids.append(np.concatenate(loops)[triangles].astype(np.int64))
-        holes += len(loops)
-    return lids, holes
+        closed += len(loops)
+    return lids, closed
 
 
 def _rims(component: Component) -> list[Faces]:
@@ -351,8 +353,8 @@ def _area_vector(points: Array) -> Array:
 def _plane_axes(points: Array) -> tuple[Array, Array]:
     """Return two axes (2, 3) and the normal (3,) of the plane of a rim (n, 3) about its mean.
 
-    The normal is the direction of the rim's area. A rim without an area is a slit: its normal is
-    across the direction to its farthest point.
+    The normal is the direction of the rim's area. A rim without an area is a slit: then it is any
+    direction perpendicular to that of the farthest point.
     """
     area, far = _area_vector(points), points[np.argmax(norm(points))]
     slit = norm(area) <= SLIT * norm(far) ** 2
@@ -362,7 +364,7 @@ def _plane_axes(points: Array) -> tuple[Array, Array]:
 
 
 def _across(direction: Array) -> Array:
-    """Return a unit vector (3,) across a direction (3,), by the axis that is least along it."""
+    """Return a unit vector (3,) perpendicular to a direction (3,) and to a coordinate axis."""
     found = np.cross(np.eye(3)[np.argmin(np.abs(direction))], direction)
     return np.asarray(found / norm(found))
 

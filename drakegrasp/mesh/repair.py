@@ -130,7 +130,7 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
 
     # Close each component; components that enclose nothing are fragments.
     closed: list[tuple[Array, Faces]] = []
-    holes, filled = 0, 0.0
+    rims, filled = 0, 0.0
     components = find_components(vertices, faces, notes)
     if len(components) > MOST_PIECES:
         raise MeshError(
@@ -138,10 +138,10 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
             "the large ones"
         )
     for component in components:
-        new_faces, new_holes, new_area = component.faces, 0, 0.0
+        new_faces, new_rims, new_area = component.faces, 0, 0.0
         if not component.is_closed:
             try:
-                lids, new_holes = close_rims(component, size)
+                lids, new_rims = close_rims(component, size)
             except MeshError as error:
                 fragments.append((component.vertices[component.faces], str(error)))
                 continue
@@ -155,7 +155,7 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
             )
             continue
         closed.append((component.vertices, new_faces))
-        holes += new_holes
+        rims += new_rims
         filled += new_area
 
     # Reject a surface that is too open to be a solid.
@@ -165,17 +165,17 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
     if share > MAX_FILLED:
         raise MeshError(
             f"holes must make up at most {MAX_FILLED:.0%} of the surface, got {share:.0%} "
-            f"({holes} open rims): the surface is too open to be a solid"
+            f"({rims} open rims): the surface is too open to be a solid"
         )
-    if holes:
-        notes.append(f"{holes} open rims were closed, {share:.1%} of the surface: solid there now")
+    if rims:
+        notes.append(f"{rims} open rims were closed, {share:.1%} of the surface: solid there now")
 
     # Unite the components, and check the result.
     vertices, faces = unite(closed, size, notes)
     check_self_intersection(vertices, faces, notes)
     if not len(faces) or not is_solid_surface(faces) or signed_volume(vertices, faces) <= 0.0:
         raise MeshError("the repaired surface must be watertight with outward normals, got gaps")
-    _drop_fragments(fragments, vertices, faces, total, notes)
+    _note_fragments(fragments, vertices, faces, total, notes)
     return Solid(vertices=vertices, faces=faces, notes=tuple(notes))
 
 
@@ -243,7 +243,7 @@ def _odd_edges(faces: Faces) -> int:
     return int((edge_ids(faces)[1] % 2).sum())
 
 
-def _drop_fragments(
+def _note_fragments(
     fragments: list[tuple[Array, str]],
     vertices: Array,
     faces: Faces,

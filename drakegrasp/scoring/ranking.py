@@ -217,7 +217,7 @@ def rank(
 
 
 def _read_view(view: View | Sequence[npt.ArrayLike]) -> View:
-    """Return a view whose depth image, mask and camera fit together.
+    """Return a view, as it is given, whose depth image, mask and camera fit together.
 
     Raises:
         GraspError: If they do not.
@@ -225,6 +225,7 @@ def _read_view(view: View | Sequence[npt.ArrayLike]) -> View:
     if len(view) != len(View._fields):
         raise GraspError(f"view must be {', '.join(View._fields)}, got {len(view)} values")
     read = View(*view)
+    # It raises the errors; what it returns is not needed.
     cloud_from_depth(read.depth, read.K, read.mask, read.X_TC)
     return read
 
@@ -404,7 +405,8 @@ def seen_neighbours(
 
     Args:
         view: As for `rank`; its mask shows the object.
-        instances: (h, w), another value on each object, 0 beside all.
+        instances: (h, w), another whole number on each object, 0 beside all. The object is the one
+            that covers most of the mask.
         walls: Walls that are known.
         config: The configuration of the lifts, with the mass of a neighbour; None for the preset
             `fast`.
@@ -414,12 +416,15 @@ def seen_neighbours(
         MeshError: If a neighbour cannot be simulated.
     """
     seen, labels = _read_view(view), np.asarray(instances)
-    if labels.shape != (size := np.shape(seen.depth)):
-        must = f"instances must be of the size {size} of the depth image"
-        raise GraspError(f"{must}, got {labels.shape}")
+    if labels.shape != (size := np.shape(seen.depth)) or labels.dtype.kind not in "iub":
+        must = f"instances must be whole numbers of the size {size} of the depth image"
+        raise GraspError(f"{must}, got {labels.dtype} of {labels.shape}")
     config = load_config("fast") if config is None else config
+    there = np.atleast_3d(seen.mask).any(axis=2)
+    values, counts = np.unique(labels[there], return_counts=True)
+    others = np.unique(labels[(labels != 0) & ~there])
     found = list[PlacedObject]()
-    for value in np.unique(labels[(labels != 0) & (np.asarray(seen.mask) == 0)]).tolist():
+    for value in others[others != values[counts.argmax()]].tolist():
         own = seen._replace(mask=(labels == value).astype(np.uint8))
         try:
             solid = hull_solid(read_cloud(cloud_from_depth(own.depth, own.K, own.mask, own.X_TC)))

@@ -121,23 +121,21 @@ def place_object(
             return replace(mesh, config=config)
         if mesh.around is not None:
             raise GraspError("X_TO must be None for an object among others, got a pose")
-        model, known = mesh.model, None
+        model = mesh.model
     elif isinstance(mesh, trimesh.Trimesh):
-        model, known = _model_of(mesh, units or "m", config), None
+        model = _model_of(mesh, units or "m", config)
     elif isinstance(mesh, str | Path):
         model = prepare_object(find_mesh(mesh, units=units or "m"), config.objects)
-        known = None
     else:
         raise MeshError(
             "mesh must be a mesh file, a trimesh.Trimesh or a placed object, "
             f"got {type(mesh).__name__}"
         )
 
-    # Take the given pose or the known one, or drop the object.
-    if X_TO is not None:
-        known = _standing(model, read_pose(X_TO, "X_TO"))
-    X_TO = settle(model, config).X_TO if known is None else known
-    return PlacedObject(model=model, X_TO=X_TO, config=config)
+    # Take the given pose, or drop the object.
+    if X_TO is None:
+        return PlacedObject(model=model, X_TO=settle(model, config).X_TO, config=config)
+    return PlacedObject(model=model, X_TO=_standing(model, read_pose(X_TO, "X_TO")), config=config)
 
 
 @one_thread

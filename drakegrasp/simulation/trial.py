@@ -289,7 +289,7 @@ def _close(
     if presses_on_neighbour(scene):
         return replace(start, closed=closed, outcome=Outcome.NEIGHBOUR_HIT)
 
-    # It lifts only an object that is held by all fingertips and nothing else.
+    # It lifts only an object that is held by all required fingertips and nothing else.
     verdict = judge_closed(
         closed.contacts.touching,
         closed.contacts.other_links,

@@ -1,4 +1,4 @@
-"""Predicted contacts: grasp vectors become a table of contact points and normals, with a margin.
+"""Predicted contacts: grasp vectors become a table of contact points and normals; their margin.
 
 Input: grasp vectors in one of five frames, as a network returned them. Output: contact points and
 unit normals in that frame, or the reason why a row is not a valid grasp. An array that cannot hold
@@ -9,9 +9,10 @@ contacts alone cannot resist.
 
 A prediction only selects contacts on the surface that the hand meets in the simulation. The
 selected contact is the closest point to the predicted one on a face whose normal is within
-`MAX_ANGLE` of the predicted normal. At an edge, where several of these faces are equally close, it
-is on the face whose normal is closest to the predicted one. A point on the wrong side of a thin
-wall is therefore moved to the side that its normal names. If no such face is within `MAX_DISTANCE`,
+`MAX_ANGLE` of the predicted normal, and which is at most `MAX_DETOUR` farther than the closest
+face. At an edge, where several of these faces are equally close, it is on the face whose normal is
+closest to the predicted one. So a point on the wrong side of a wall that is thinner than
+`MAX_DETOUR` is moved to the side that its normal names. If no such face is within `MAX_DISTANCE`,
 the contact is on the closest face of all.
 
 A fingertip touches at a point with Coulomb friction. It pushes along the inward normal and along

@@ -71,7 +71,7 @@ class PoseTrial:
 
     @property
     def lifted(self) -> bool:
-        """Whether every fingertip touches the object at the end of the lift, clear of the table."""
+        """Whether each required fingertip touches the object after the lift, above the table."""
         return self.trial.outcome is Outcome.SUCCESS
 
 
@@ -89,7 +89,9 @@ class Verification:
         p_OQ, nhat_Q_O: (k, 3), the contact points [m] and unit normals in {O} that were tried; NaN
             for an invalid row or a posture.
         surface_distance: (k,), distances of the predicted points from the object's surface [m].
-        tries: The wrist poses that were simulated, in order; none for an invalid row.
+        tries: The wrist poses that were simulated, in order; none for an invalid row. Of a grasp of
+            two contacts, poses at which the open hand would be in object or table are left out,
+            unless all are.
         seconds: Wall-clock time by stage [s].
         stand: Index of the resting pose of this verdict: the best of those in which a posture was
             tried.

@@ -15,8 +15,8 @@ Each room gets equally many faults. In a room first the kind is drawn, then the 
 kinds are as frequent as common ones. Texts of messages and annotations stay unchanged, and so do
 the numbers of pages and pictures, which are layout. The same seed draws the same faults from the
 same source. The tests of a fault are those of its module, then others of its room, then tests of
-other rooms that import the module, then those of the whole package. Faults that were examined and
-change no result are listed in `equivalent_faults.yaml`; they are not drawn.
+other rooms that import the module or a user of it, then those of the whole package. Faults that
+were examined and change no result are listed in `equivalent_faults.yaml`; they are not drawn.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ EQUIVALENT = Path(__file__).with_name("equivalent_faults.yaml")
 ROOT_ROOM = "drakegrasp"
 #: Rooms that draw: their numbers are widths, margins and colours.
 LAYOUT = ("page", "pictures")
-#: Maximum number of imports between a module and a test of another room.
+#: Maximum number of modules between a module and a test of another room that needs it.
 NEAR = 1
-#: Maximum number of test files for a fault.
+#: Maximum number of test files of a module, beside those of the whole package.
 MOST_TESTS = 16
 #: Tests of what comes out of all rooms.
 WHOLE = ("tests/test_numbers.py", "tests/test_pins.py", "tests/test_equal_draws.py")
@@ -240,10 +240,26 @@ def _changes_of_call(node: ast.Call, own: _Text) -> Iterator[_Change]:
         yield kind, node, f"{own(node.func)}({', '.join(given)})"
 
 
+@cache
+def equivalent_faults() -> frozenset[tuple[str, str]]:
+    """Return the file and the new line of each fault that is known to change no result.
+
+    Raises:
+        ValueError: If an entry is not of exactly one fault, because the source has changed.
+    """
+    entries = yaml.safe_load(EQUIVALENT.read_text(encoding="utf-8"))
+    for entry in entries:
+        news = [str(fault["new"]).strip() for fault in faults_of(entry["file"])]
+        if (count := news.count(entry["new"])) != 1:
+            must = f"must have one fault {entry['new']!r}"
+            raise ValueError(f"{EQUIVALENT.name}: {entry['file']} {must}, got {count}")
+    return frozenset((entry["file"], entry["new"]) for entry in entries)
+
+
 def drawn_in(room: str, seed: int) -> Iterator[dict[str, object]]:
     """Yield the faults of a room in the order in which they are drawn, without equivalent ones."""
     stream = random.Random(f"{seed} {room}")
-    known = {(e["file"], e["new"]) for e in yaml.safe_load(EQUIVALENT.read_text(encoding="utf-8"))}
+    known = equivalent_faults()
     kinds: dict[object, list[dict[str, object]]] = {}
     for fault in (fault for name in modules(room) for fault in faults_of(name)):
         if fault["kind"] != "number" or room not in LAYOUT:

@@ -3,7 +3,8 @@
 The table `planted_faults.yaml` contains faults that were once planted by hand and that no test
 found; `draw_faults.py` draws others. A fault is a text that is replaced in one file, together with
 the tests that must notice it. The script prints JSON: for each fault whether a test failed, and how
-many seconds that took. The exit code is 1 if a fault was not found.
+many seconds that took. The exit code is 1 if a fault was not found, and 2 if a test fails without
+a fault.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ def with_fault(text: str, fault: dict[str, Any]) -> str:
             times.
 
     Raises:
-        ValueError: If the text does not contain `old`, or contains it several times.
+        ValueError: If the text does not contain `old` from the line on, or contains it several
+            times and no line is stated.
     """
     lines = text.splitlines(keepends=True)
     start = sum(map(len, lines[: fault.get("line", 1) - 1]))

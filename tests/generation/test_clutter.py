@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,14 +20,17 @@ import drakegrasp as dg
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.clutter import load_scene
 from drakegrasp.dataset.paths import CLUTTER_FOLDER, clutter_path
+from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.schema import HITS_NOTHING, NOT_TRIED
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.generation import clutter_scene
 from drakegrasp.generation.clutter import ClutterRequest, make_clutter
 from drakegrasp.objects.surroundings import surroundings_of
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import processes
 from drakegrasp.simulation.fixtures import load_surroundings
+from drakegrasp.simulation.pile import PileError
 
 pytestmark = pytest.mark.sim
 
@@ -55,6 +61,30 @@ def test_bytes_depend_neither_on_workers_nor_on_what_was_there(cluttered: Path) 
         assert (file["grasps/outcome"][:] == NOT_TRIED).all()
     make_clutter(cluttered, asked())
     assert (cluttered / "clutter.hdf5").read_bytes() == before
+
+
+def test_each_object_falls_from_one_of_its_resting_poses(
+    small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two poses, of which the second is three times as probable."""
+    drawn = []
+
+    def load(*place: Any) -> PreparedObject:
+        first = load_prepared(*place)
+        poses = np.array([first.resting_poses[0], np.eye(4)])
+        return replace(first, resting_poses=poses, probability=np.array([0.25, 0.75]))
+
+    def fall(models: Any, resting: Sequence[np.ndarray], *_: Any) -> None:
+        drawn.extend(np.array_equal(X, np.eye(4)) for X in resting)
+        raise PileError("seen")
+
+    monkeypatch.setattr(clutter_scene, "load_prepared", load)
+    monkeypatch.setattr(clutter_scene, "pile_up", fall)
+    out = Path(shutil.copytree(small_dataset, tmp_path / "out"))
+    with pytest.raises(DataError, match="got: seen"):
+        make_clutter(out, asked(scenes=1, low=3, high=3))
+    assert len(drawn) >= 40
+    assert 0.55 < np.mean(drawn) < 0.95
 
 
 def test_every_sample_of_an_object_is_a_grasp_and_moves_with_it(cluttered: Path) -> None:

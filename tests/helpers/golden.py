@@ -20,6 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from scipy.spatial import KDTree
 
 FOLDER = Path(__file__).parents[1] / "golden"
 #: A number with decimals, which need only be near.
@@ -46,12 +47,13 @@ def rounded(text: str) -> str:
 
 
 def short(value: float) -> str:
-    """Return a number with five digits; what is only rounding is 0."""
-    return f"{0.0 if abs(value) < 1e-7 else value:#.5g}"
+    """Return a number with five digits and a decimal; what is only rounding is 0."""
+    text = f"{0.0 if abs(value) < 1e-7 else value:#.5g}"
+    return f"{text}0" if text.endswith(".") else text
 
 
 def _near(expected: str | None, found: str | None) -> bool:
-    """Return whether two lines are equal but for the last digits of numbers."""
+    """Return whether lines are equal but for numbers that differ by a thousandth, or 1e-6."""
     if expected is None or found is None or expected == found:
         return expected == found
     numbers = [[float(n) for n in DECIMAL.findall(line)] for line in (expected, found)]
@@ -152,13 +154,18 @@ def flat(value: Any, name: str = "") -> Iterator[str]:
 
 # Values of any kind.
 
-#: An array of more numbers is told by its means.
+#: An array of more numbers is told by its means, and more words by their counts.
 FEW = 8
+#: Types of what is not told: files, and trees of points that are told.
+UNTOLD = (bytes, KDTree)
 
 
-def told(value: Any, name: str = "") -> str:
-    """Return lines with all numbers and words of a value; a large array has a line of means."""
-    return "\n".join(_lines(value, name))
+def told(values: Mapping[str, Any]) -> str:
+    """Return lines with the numbers and words of values by their names.
+
+    A large array has a line of means, and many words have their counts.
+    """
+    return "\n".join(_lines(values, ""))
 
 
 def _lines(value: Any, name: str) -> Iterator[str]:
@@ -183,6 +190,8 @@ def _lines(value: Any, name: str) -> Iterator[str]:
                 yield from _lines(each, f"{name}/{number}")
     elif isinstance(value, str | None):
         yield f"{name}: {value!r}"
+    elif not isinstance(value, UNTOLD):
+        raise TypeError(f"{name}: must be of numbers and words, got a {type(value).__name__}")
 
 
 def _is_numbers(value: Any) -> bool:
@@ -195,7 +204,8 @@ def _is_numbers(value: Any) -> bool:
 def _numbers(value: np.ndarray) -> str:
     """Return an array as text: its shape, then its values, or three means and what is not finite.
 
-    The means are of values, of sizes, and of values with weights that grow from row to row.
+    The means are of values, of their sizes, and of values with weights that grow from the first, 0,
+    to the last, 1.
     """
     if value.size <= FEW:
         return f"{value.shape} {' '.join(map(_number, value.ravel().tolist()))}"

@@ -75,6 +75,16 @@ def test_rooms_have_equally_many_faults_but_for_layout_and_equivalent_ones(
     )
 
 
+def test_fault_without_effect_is_one_of_this_source(
+    draw_faults: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert load_script("measurements/draw_faults").equivalent_faults()
+    monkeypatch.setattr(draw_faults, "EQUIVALENT", tmp_path / "equivalent.yaml")
+    draw_faults.EQUIVALENT.write_text("- {file: drakegrasp/frames.py, new: UP = (2), why: none}\n")
+    with pytest.raises(ValueError, match=r"frames\.py must have one fault 'UP = \(2\)', got 0"):
+        draw_faults.equivalent_faults()
+
+
 def test_tests_of_a_module_are_those_of_its_room_and_near_ones(draw_faults: ModuleType) -> None:
     imports = {
         "hand/test_far.py": "",

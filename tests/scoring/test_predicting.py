@@ -176,8 +176,17 @@ def test_the_others_are_completed_from_the_view(
     due = load_scene(rows.path, int(rows.scenes[0])).X_TO[1 - int(rows.places[0])]
     assert np.linalg.norm(X_TN[:3, 3] - due[:3, 3]) < 0.03
     assert 0.04 < 2.0 * model.half_extents.max() < 0.2
-    with pytest.raises(dg.GraspError, match=r"instances must be of the size .*, got \(1, 2\)"):
+    must = r"instances must be whole numbers of the size .*, got "
+    with pytest.raises(dg.GraspError, match=must + r"int64 of \(1, 2\)"):
         dg.seen_neighbours(view, [[0, 1]])
+    with pytest.raises(dg.GraspError, match=must + "float64 of"):
+        dg.seen_neighbours(view, instances + 0.5)
+
+    # A mask that is smaller than the object in the instances makes it no neighbour of its own.
+    smaller = np.array(view.mask)
+    smaller[np.flatnonzero(smaller.any(axis=1))[0]] = 0
+    again = dg.seen_neighbours(view._replace(mask=smaller), instances, config=dataset_config(rows))
+    assert len(again.models) == 1
 
 
 @pytest.mark.sim
