@@ -39,6 +39,7 @@ from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.scoring.run import VERDICTS
+from drakegrasp.simulation.attempts import CONDITIONS
 
 NAME, HAND = "1_brick_a", "allegro_four"
 #: What decides verdicts and is in no file that was exported.
@@ -172,6 +173,9 @@ def test_what_goes_out_comes_in_again(
     table = read_attempts(path, hand)
     order = in_order(samples, table.X_FG)
     np.testing.assert_allclose(table.q_grasp, samples["closed_q"][order], atol=1e-6)
+    if form == "dexgraspbench":
+        tried = np.column_stack([samples[name] for name in CONDITIONS])
+        np.testing.assert_allclose(table.conditions, tried[order])
     names = [hand.preshape_names[k] for k in samples["preshape"][order]]
     assert list(table.preshape) == names
     if form not in OWN:

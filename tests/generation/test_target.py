@@ -87,6 +87,16 @@ def test_number_that_was_asked_for_is_the_number(wanted: int) -> None:
     assert found["short"] == 3 or abs(found["short"] - found["poor"]) <= 1
 
 
+def test_object_that_has_its_samples_gets_no_more_units() -> None:
+    target, begun = make_target(samples_per_object=2 * UNIT), list[str]()
+    while None in target.taken().values():
+        for unit in target.next_units():
+            begun.append(unit.object_name)
+            end(target, unit)
+    assert begun.count("rich") == 2
+    assert begun.count("barren") == PATIENCE // UNIT
+
+
 @pytest.mark.parametrize("ends", [{"samples_per_object": 4}, {"samples": 40}])
 @pytest.mark.parametrize("workers", [3, 30])
 def test_result_does_not_depend_on_units_that_were_run_in_vain(

@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import yaml
 from helpers.commands import run
@@ -188,21 +189,22 @@ def test_slip_of_fingers_that_are_pushed_open_is_told() -> None:
     assert own.endswith("with fingers that motors of its own strength keep closed")
 
 
-def test_trial_grasps_are_lifted_to_their_end(monkeypatch) -> None:
-    """The one with locked fingers and the one with its own."""
+@pytest.mark.parametrize(("turn_deg", "ok"), [(9.0, True), (11.0, False)])
+def test_trial_grasps_are_lifted_to_their_end(monkeypatch, turn_deg, ok) -> None:
+    """The one with locked fingers and the one with its own; a sample may turn by 10 degrees."""
     configs = []
 
     def hold(scene, X_TO, attempt, config):
         configs.append(config)
-        still = SimpleNamespace(slip=0.0, turn=0.0)
+        still = SimpleNamespace(slip=0.0, turn=np.deg2rad(turn_deg))
         return TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG, lift=still)
 
     module = "drakegrasp.hand_setup"
     monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)
     monkeypatch.setattr(f"{module}.run_attempt", hold)
     config = load_config(overrides=["lift.drive=torque", "lift.stop_when=lost_sample"])
-    assert check_grasp(load_hand("allegro"), config, "box").ok
-    assert [each.lift.drive for each in configs] == ["locked", "torque"]
+    assert check_grasp(load_hand("allegro"), config, "box").ok == ok
+    assert [each.lift.drive for each in configs][:2] == ["locked", "torque" if ok else "locked"]
     assert {each.lift.stop_when for each in configs} == {"never"}
 
 
