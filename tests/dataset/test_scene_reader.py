@@ -15,7 +15,7 @@ from helpers.datasets import REPEATED, make_dataset
 
 from drakegrasp.dataset.scenes import SceneDataset, count_scenes
 from drakegrasp.errors import DataError
-from drakegrasp.frames import invert_pose, transform_points
+from drakegrasp.frames import invert_pose, rotate_vectors, transform_points
 from drakegrasp.generation.scenes import make_scenes
 
 pytestmark = pytest.mark.sim
@@ -53,6 +53,13 @@ def test_points_lie_on_object_and_table(path: Path, frame: Any) -> None:
     touching = np.isfinite(item["p_AQ"]).all(axis=2)
     p_OQ = transform_points(X_OA, item["p_AQ"][touching])
     assert np.abs(np.abs(p_OQ) - half).min(axis=1).max() < 1e-3
+    # They press against the sides of the box, also those of the lifted hand.
+    for lifted in ("", "_lifted"):
+        there = np.isfinite(item[f"p_AQ{lifted}"]).all(axis=2)
+        n, f = (item[f"{key}{lifted}"][there] for key in ("nhat_Q_A", "f_Q_A"))
+        along = np.abs(rotate_vectors(X_OA, n)).max(axis=1)
+        np.testing.assert_allclose(along, 1.0, atol=1e-5)
+        np.testing.assert_allclose(f, -np.linalg.norm(f, axis=1, keepdims=True) * n, atol=1e-3)
 
 
 def test_good_and_bad_grasps_come_in_turns(path: Path) -> None:
