@@ -241,19 +241,27 @@ def _changes_of_call(node: ast.Call, own: _Text) -> Iterator[_Change]:
 
 
 @cache
-def equivalent_faults() -> frozenset[tuple[str, str]]:
-    """Return the file and the new line of each fault that is known to change no result.
+def equivalent_faults() -> frozenset[tuple[str, str, str]]:
+    """Return the file, the old and the new line of each fault that is known to change no result.
 
     Raises:
         ValueError: If an entry is not of exactly one fault, because the source has changed.
     """
-    entries = yaml.safe_load(EQUIVALENT.read_text(encoding="utf-8"))
-    for entry in entries:
-        news = [str(fault["new"]).strip() for fault in faults_of(entry["file"])]
-        if (count := news.count(entry["new"])) != 1:
-            must = f"must have one fault {entry['new']!r}"
-            raise ValueError(f"{EQUIVALENT.name}: {entry['file']} {must}, got {count}")
-    return frozenset((entry["file"], entry["new"]) for entry in entries)
+    found = list[tuple[str, str, str]]()
+    for entry in yaml.safe_load(EQUIVALENT.read_text(encoding="utf-8")):
+        file, old, new = entry["file"], entry.get("old"), entry["new"]
+        known = {_lines(fault) for fault in faults_of(file)}
+        same = [each for each in known if each[2] == new and old in (None, each[1])]
+        if len(same) != 1:
+            must = f"{EQUIVALENT.name}: {file} must have one fault {new!r}"
+            raise ValueError(f"{must}, got {len(same)}")
+        found += same
+    return frozenset(found)
+
+
+def _lines(fault: dict[str, object]) -> tuple[str, str, str]:
+    """Return what tells a fault: its file, its old line and its new line."""
+    return str(fault["file"]), str(fault["old"]).strip(), str(fault["new"]).strip()
 
 
 def drawn_in(room: str, seed: int) -> Iterator[dict[str, object]]:
@@ -269,7 +277,7 @@ def drawn_in(room: str, seed: int) -> Iterator[dict[str, object]]:
         fault = kinds[kind].pop(stream.randrange(len(kinds[kind])))
         if not kinds[kind]:
             del kinds[kind]
-        if (fault["file"], str(fault["new"]).strip()) not in known:
+        if _lines(fault) not in known:
             yield fault
 
 

@@ -139,6 +139,8 @@ def run_tests(folder: Path, tests: Sequence[str], timeout: float) -> tuple[int, 
 
 def _run(folder: Path, tests: list[str], timeout: float, output: int) -> None:
     os.setsid()
+    # A process in the background of a shell ignores Ctrl-C, and so would those of the tests.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     for stream in (1, 2):
         os.dup2(output, stream)
     os.chdir(folder)
