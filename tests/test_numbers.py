@@ -171,7 +171,9 @@ def test_cameras(golden: Golden) -> None:
     config, stream, X_TG = dg.load_config("randomized"), Stream(3), standing_palm()
     (depth, mask), lens = image(), read_lens(K)
     clean = np.where(np.isfinite(depth) & (depth > 0.0), depth, 2.0).astype(np.float32)
-    p_TQ, nhat_Q_T = cloud_from_depth(depth, K, mask, X_TC)[::50], np.tile([0.0, 0.0, 1.0], (99, 1))
+    p_TQ = cloud_from_depth(depth, K, mask, X_TC)[::50]
+    # Every second normal points down, away from the camera.
+    nhat_Q_T = np.where(np.arange(len(p_TQ))[:, None] % 2, [0.0, 0.0, -1.0], [0.0, 0.0, 1.0])
     sensor = camera.DepthSensor(noise=1e-3, baseline=0.02, seed=7)
     found = {
         "K": camera.intrinsics(config.camera),
@@ -180,7 +182,7 @@ def test_cameras(golden: Golden) -> None:
         "fixed": camera.fixed_viewpoints(),
         "drawn": [camera.draw_viewpoint(stream, X_TG[:3, 3], config.scenes) for _ in range(3)],
         "image frame": camera.image_frame(K, mask, depth),
-        "visible": camera.visible_contacts(p_TQ, nhat_Q_T[: len(p_TQ)], X_TC, K, clean, mask),
+        "visible": camera.visible_contacts(p_TQ, nhat_Q_T, X_TC, K, clean, mask),
         "spoilt": camera.spoil_depth(clean, K, sensor, 1, config.camera),
         "shadow": camera.shadow(clean, K, 0.02),
         "colours": [camera.usual_appearance(name) for name in ("1_mug", "2_box")],
