@@ -202,7 +202,6 @@ def find_meshes(
 
     # The stems of the files; some file systems store é as two characters, the manifest as one.
     stems = {path: unicodedata.normalize("NFC", path.stem) for path in sorted(paths)}
-    _validate_distinct(directory, stems)
 
     # The manifest, which may only refer to these files.
     if manifest is None and (directory / MANIFEST_NAME).is_file():

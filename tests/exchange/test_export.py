@@ -20,7 +20,7 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, DiskFullError
 from drakegrasp.exchange import dexgraspbench
-from drakegrasp.exchange.export import ClosedGrasp, export_dataset
+from drakegrasp.exchange.export import ClosedGrasp, export_dataset, options_of
 from drakegrasp.frames import rotate_vectors, transform_points, unpack_pose
 from drakegrasp.objects.model import load_object, prepare_object
 from drakegrasp.objects.sources import find_meshes
@@ -52,6 +52,17 @@ def test_command_says_how_many_samples_go_where(
         assert done.exit_code == 0, done.output
         assert f"{len(grasps)} samples in {folder}" in done.output
         assert list(folder.rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("form", registry.names("exporters"))
+def test_progress_ends_with_all(dataset: Path, tmp_path: Path, form: str) -> None:
+    calls = list[tuple[int, int]]()
+    said = {"licence": "cc-by-4.0"} if "licence" in options_of(form) else {}
+    report = lambda done, total: calls.append((done, total))  # noqa: E731
+    count = export_dataset(dataset, tmp_path / "to", form, progress=report, **said)
+    done, total = calls[-1]
+    assert done == total and total in (count, 2 * count)  # of one data file, or of both
+    assert [each for each, _ in calls] == sorted(each for each, _ in calls)
 
 
 def test_folder_that_holds_files_is_refused(dataset: Path, tmp_path: Path) -> None:

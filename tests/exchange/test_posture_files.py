@@ -406,6 +406,12 @@ def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
         read_attempts(tmp_path / name, HAND)
 
 
+def test_file_that_is_not_there_is_refused_in_a_line(tmp_path):
+    path = tmp_path / "none.npz"
+    with pytest.raises(GraspError, match=f"postures must be a file or a folder .*, got '{path}'"):
+        read_attempts(path, HAND)
+
+
 def test_rows_without_an_object_are_of_the_one_that_is_named(tmp_path):
     np.savez(tmp_path / "p.npz", X_FG=POSES)
     assert read_attempts(tmp_path / "p.npz", HAND, of="cup").objects == ("cup", "cup")

@@ -189,15 +189,22 @@ def test_slip_of_fingers_that_are_pushed_open_is_told() -> None:
     assert own.endswith("with fingers that motors of its own strength keep closed")
 
 
-@pytest.mark.parametrize(("turn_deg", "ok"), [(9.0, True), (11.0, False)])
-def test_trial_grasps_are_lifted_to_their_end(monkeypatch, turn_deg, ok) -> None:
+@pytest.mark.parametrize(
+    ("outcome", "turn_deg", "ok"),
+    [
+        (Outcome.SUCCESS, 9.0, True),
+        (Outcome.SUCCESS, 11.0, False),
+        (Outcome.DROPPED, 9.0, False),
+    ],
+)
+def test_trial_grasps_are_lifted_to_their_end(monkeypatch, outcome, turn_deg, ok) -> None:
     """The one with locked fingers and the one with its own; a sample may turn by 10 degrees."""
     configs = []
 
     def hold(scene, X_TO, attempt, config):
         configs.append(config)
         still = SimpleNamespace(slip=0.0, turn=np.deg2rad(turn_deg))
-        return TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG, lift=still)
+        return TrialRecord(outcome=outcome, X_TO=X_TO, X_OG=attempt.X_OG, lift=still)
 
     module = "drakegrasp.hand_setup"
     monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)
