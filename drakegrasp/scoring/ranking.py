@@ -420,9 +420,13 @@ def seen_neighbours(
         must = f"instances must be whole numbers of the size {size} of the depth image"
         raise GraspError(f"{must}, got {labels.dtype} of {labels.shape}")
     config = load_config("fast") if config is None else config
+
+    # The neighbours; the object itself may reach beyond its mask.
     there = np.atleast_3d(seen.mask).any(axis=2)
     values, counts = np.unique(labels[there], return_counts=True)
     others = np.unique(labels[(labels != 0) & ~there])
+
+    # Each is completed as if it was the object.
     found = list[PlacedObject]()
     for value in others[others != values[counts.argmax()]].tolist():
         own = seen._replace(mask=(labels == value).astype(np.uint8))

@@ -225,3 +225,10 @@ def test_files_of_a_card_are_whole_and_come_again(data, tmp_path):
     picture = paths[2].read_bytes()
     assert picture.startswith(b"\x89PNG")
     assert made.save(tmp_path)[2].read_bytes() == picture
+
+
+@pytest.mark.parametrize("where", ["client", "scheduler", "scheduler_file"])
+def test_protocol_of_mujoco_runs_on_this_machine(data, where):
+    pytest.importorskip("mujoco")
+    with pytest.raises(dg.ConfigError, match=f"^{where} must be None with protocol dexgraspbench"):
+        dg.score([], data, protocol="dexgraspbench", **{where: "tcp://x"})
